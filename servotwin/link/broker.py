@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
-from servotwin.link.connection_errors import cause_of
-from servotwin.link.url import tls_context
+from servotwin.link.connection_errors import cause_of, is_of_certificate
+from servotwin.link.url import read_again, tls_context
 from servotwin.runtime.extras import missing_extra
 
 if TYPE_CHECKING:
+    import ssl
+
     from paho.mqtt.client import Client, MQTTMessage
 
 _SCHEMES = {"mqtt": 1883, "mqtts": 8883}
@@ -152,9 +154,9 @@ class Connection:
     def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
         self._session, self._events = session, events
         self._number, self._fresh, self._up, self._answered, self._closing = 0, True, False, False, False
-        self._trust = broker.tls, broker.ca_file
+        self._broker, self._context = broker, tls_context(broker.ca_file) if broker.tls else None
         self._hint = "" if broker.tls else ": where its port is one with TLS, url begins with mqtts://"
-        self._client = _client(broker, session)
+        self._client = _client(broker, session, self._context)
         self._client.on_socket_open = _no_delay
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_subscribe, self._client.on_message = self._subscribed, self._message
@@ -215,7 +217,10 @@ class Connection:
 
     def _failed(self, _client: Client, _user: Any) -> None:
         # paho calls this while it handles the exception, which it does not pass on.
-        self._events.lost(f"the broker cannot be reached ({cause_of(sys.exc_info()[1], *self._trust)})")
+        error, broker = sys.exc_info()[1], self._broker
+        if self._context is not None and is_of_certificate(error):
+            read_again(self._context, broker.ca_file)  # for the next try: its file may have been renewed
+        self._events.lost(f"the broker cannot be reached ({cause_of(error, broker.tls, broker.ca_file)})")
 
     def _published(self, _client: Client, _user: Any, mid: int, reason: Any, _properties: Any) -> None:
         if reason.value == _NO_SUBSCRIBERS:
@@ -248,7 +253,7 @@ def _import_paho() -> None:
         raise missing_extra("paho", "the link over MQTT") from None
 
 
-def _client(broker: Broker, session: MqttSession) -> Client:
+def _client(broker: Broker, session: MqttSession, context: ssl.SSLContext | None) -> Client:
     _import_paho()
     from paho.mqtt.client import Client, MQTTv5
     from paho.mqtt.enums import CallbackAPIVersion
@@ -259,8 +264,8 @@ def _client(broker: Broker, session: MqttSession) -> Client:
     client.reconnect_delay_set(1, 4)
     if broker.user is not None:
         client.username_pw_set(broker.user, broker.password)
-    if broker.tls:
-        client.tls_set_context(tls_context(broker.ca_file))
+    if context is not None:
+        client.tls_set_context(context)
     if session.will:
         client.will_set(session.will, b"", qos=1)
     return client

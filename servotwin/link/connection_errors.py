@@ -53,6 +53,11 @@ def cause_of(error: object, encrypted: bool, ca: str | Path | None, key: str = "
     return _fault_of_tls(error)
 
 
+def is_of_certificate(error: object) -> bool:
+    """True where a connection failed because the server's certificate was not accepted."""
+    return isinstance(error, ssl.SSLCertVerificationError)
+
+
 def _fault_of_tls(error: object) -> str:
     """Name the cause of a failed handshake whose certificate is not to blame."""
     reason = getattr(error, "reason", None) or ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
@@ -69,3 +70,15 @@ def tls_context(ca_file: str | None) -> ssl.SSLContext:
     except OSError as error:  # ssl.SSLError is one
         reason = error.strerror or error
         raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({reason}); give a PEM file") from None
+
+
+def read_again(context: ssl.SSLContext, ca_file: str | None) -> None:
+    """Trust also what the file of certificates, or the system's, holds now; one that is being replaced changes nothing.
+
+    What the context trusted before it goes on trusting.
+    """
+    with suppress(OSError):
+        if ca_file is None:
+            context.load_default_certs()
+        else:
+            context.load_verify_locations(ca_file)

@@ -9,6 +9,7 @@ from queue import Queue
 from threading import Thread
 
 import pytest
+from mosquitto import Mosquitto, Tls
 from selfsigned import self_made, without_intermediate
 from wiretap import Wiretap, wiretap
 
@@ -198,3 +199,26 @@ def _listen(link: HttpTransport, ended: "Queue[Exception]") -> None:
         link.listen(0)
     except Exception as error:
         ended.put(error)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*ssl.SSLSocket:pytest.PytestUnraisableExceptionWarning")  # paho closes it so
+def test_a_broker_with_a_renewed_certificate_is_reached_once_the_trusted_file_is_renewed(tmp_path: Path) -> None:
+    """A twin had to be restarted for it."""
+    (tmp_path / "new").mkdir()
+    trusted, renewed = self_made(tmp_path)[0], self_made(tmp_path / "new")
+    server = Mosquitto(tmp_path, tls=Tls(*renewed))
+    told: Queue[str] = Queue()
+    events = MqttCallbacks(lambda *_: None, lambda _forgotten: told.put("ready"), told.put)
+    server.start()
+    connection = Connection(Broker(server.url, ca_file=str(trusted)), MqttSession("twin", ("t",), 0), events)
+    try:
+        assert "does not lead to one of ca_file" in told.get(timeout=30.0)
+        trusted.write_bytes(b"half of a file")
+        assert "does not lead to one of ca_file" in told.get(timeout=30.0)
+        trusted.write_bytes(renewed[0].read_bytes())
+        while (word := told.get(timeout=30.0)) != "ready":
+            assert "does not lead to one of ca_file" in word
+    finally:
+        connection.close()
+        server.kill()
