@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import socket
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
-from threading import Lock
-from typing import TYPE_CHECKING
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 import msgspec
 
 from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import HeldClaim
-from servotwin.link.connection_errors import cause_of
+from servotwin.link.http_connection import HttpAnswer, PersistentConnection
 from servotwin.link.transport import LONGEST_OLDER_PAUSE_S, Parcel, Refused, Unreachable
-from servotwin.link.url import is_encrypted, tls_context
 from servotwin.messages import MAX_BYTES, Acknowledge, ClaimStatus, EdgeClaim, InvalidMessage, Refusal, decode, encode
 from servotwin.messages.live import LiveColumns, decode_watched, encode_live
-
-if TYPE_CHECKING:
-    import ssl
 
 BODY = "application/msgpack"
 CLAIM = "Servotwin-Claim"
@@ -32,7 +21,6 @@ WAITING, OLDER_PAUSE = "Servotwin-Waiting", "Servotwin-Older-Pause"
 s. A version that does not know them ignores them."""
 _LONGEST_PAUSE_S = 300.0
 """A longer Retry-After is cut to this."""
-_PIECE = 65536
 _NO_ADDRESS = 404, 405
 """Statuses of a twin that knows no such path, or not that method: it has judged no message."""
 _MARKS = 5
@@ -50,148 +38,6 @@ class _RefusalBody(msgspec.Struct, frozen=True):
     mark: str = ""
 
 
-class _Response(msgspec.Struct, frozen=True):
-    """Status, body, Retry-After and pause before older windows of a response."""
-
-    status: int
-    body: bytes
-    retry_after: str
-    older_pause: str = ""
-
-
-class _TlsConnection(HTTPSConnection):
-    """A connection whose socket can be shut down while its handshake is under way."""
-
-    def __init__(self, host: str, port: int | None, timeout: float, context: ssl.SSLContext) -> None:
-        super().__init__(host, port, timeout=timeout, context=context)
-        self._tls = context
-
-    def connect(self) -> None:
-        """Connect, and do the handshake on a socket that is known already."""
-        HTTPConnection.connect(self)
-        encrypted = self._tls.wrap_socket(self.sock, server_hostname=self.host, do_handshake_on_connect=False)
-        self.sock = encrypted
-        encrypted.do_handshake()
-
-
-class _PersistentConnection:
-    """One connection, which stays open from request to request and is opened again when the server has closed it.
-
-    Parameters
-    ----------
-    url : str
-        http(s)://host[:port][/path].
-    token : str
-    timeout_s : float
-        Time limit of one request and its response, s.
-    ca_file : str, optional
-        As of `HttpTransport`.
-    clock : callable
-        Returns monotonic seconds.
-    """
-
-    def __init__(
-        self,
-        url: str,
-        token: str,
-        timeout_s: float,
-        ca_file: str | None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._parts, self._timeout, self._ca_file, self._clock = urlsplit(url), timeout_s, ca_file, clock
-        self._context = tls_context(ca_file) if is_encrypted(url) else None
-        self._headers = {"Authorization": f"Bearer {token}", "Accept": BODY}
-        self._connection: HTTPConnection | None = None
-        self._closed, self._busy = False, Lock()
-
-    def request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
-        """Send one request and return its response, of `limit` bytes at most; raises Unreachable."""
-        with self._busy:
-            try:
-                return self._request(method, path, body, headers, limit)
-            finally:
-                # Where the socket was still being connected, `close` found none to shut down.
-                if self._closed:
-                    self.drop()
-
-    def _request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
-        fresh = self._connection is None
-        try:
-            return self._request_once(method, path, body, headers, limit)
-        except (OSError, HTTPException, ValueError) as error:
-            self.drop()
-            # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
-            if fresh or isinstance(error, TimeoutError):
-                raise Unreachable(cause_of(error, self._context is not None, self._ca_file)) from None
-        return self._request(method, path, body, headers, limit)
-
-    def drop(self) -> None:
-        """Close the connection; the next request opens another."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
-
-    @contextmanager
-    def in_step(self) -> Iterator[None]:
-        """Drop the connection where the block finds that an answer is none: those of later requests may follow it."""
-        try:
-            yield
-        except Unreachable:
-            with self._busy:
-                self.drop()
-            raise
-
-    def close(self) -> None:
-        """Allow no more requests; the one under way fails at once."""
-        self._closed = True
-        connection = self._connection
-        # A request under way has the lock until its time limit: its socket is shut down instead, which wakes it.
-        if self._busy.acquire(blocking=False):
-            self.drop()
-            self._busy.release()
-        elif connection is not None and connection.sock is not None:
-            _shut(connection)
-
-    def _request_once(
-        self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int
-    ) -> _Response:
-        connection = self._connection or self._open()
-        deadline = self._clock() + self._timeout
-        connection.request(method, self._parts.path.rstrip("/") + path, body, {**self._headers, **headers})
-        response = connection.getresponse()
-        data = self._read(response, limit, deadline)
-        if response.will_close:
-            self.drop()
-        headers_back = response.headers
-        return _Response(response.status, data, headers_back.get("Retry-After", ""), headers_back.get(OLDER_PAUSE, ""))
-
-    def _open(self) -> HTTPConnection:
-        if self._closed:
-            raise Unreachable("the link is closed")
-        host, port = self._parts.hostname or "", self._parts.port
-        if self._context is None:
-            self._connection = HTTPConnection(host, port, timeout=self._timeout)
-        else:
-            self._connection = _TlsConnection(host, port, timeout=self._timeout, context=self._context)
-        return self._connection
-
-    def _read(self, response: HTTPResponse, limit: int, deadline: float) -> bytes:
-        """Read the body; raise where it is longer than `limit` bytes, or not complete at the deadline."""
-        pieces: list[bytes] = []
-        size = 0
-        while piece := response.read1(_PIECE):
-            size += len(piece)
-            if size > limit:
-                raise HTTPException(f"a response of more than {limit} bytes")
-            # The socket's time limit begins anew with every byte, so that a slow sender would occupy the thread for
-            # ever.
-            if self._clock() > deadline:
-                raise TimeoutError("the response takes too long")
-            pieces.append(piece)
-        response.close()  # the connection is free for the next request only after this
-        return b"".join(pieces)
-
-
 class LiveHttp:
     """Live view of one servo: columns to the twin, and its word whether somebody watches; over a connection of its own.
 
@@ -205,7 +51,7 @@ class LiveHttp:
         self, url: str, servo: str, token: str, ca_file: str | None, timeout_s: float = 10.0, wait_s: float = 25.0
     ) -> None:
         self._path, self._wait = f"/v1/servos/{quote(servo, safe='')}/live", wait_s
-        self._connection = _PersistentConnection(url, token, timeout_s + wait_s, ca_file)
+        self._connection = PersistentConnection(url, _headers(token), timeout_s + wait_s, ca_file)
 
     def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
         """Send columns; without any, wait until somebody watches. Return True while somebody does.
@@ -258,8 +104,8 @@ class HttpTransport:
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
         self.claim = HeldClaim()
         self._twin_marks = False
-        self._up = _PersistentConnection(url, token, timeout_s, ca_file)
-        self._down = _PersistentConnection(url, token, timeout_s + wait_s, ca_file)
+        self._up = PersistentConnection(url, _headers(token), timeout_s, ca_file)
+        self._down = PersistentConnection(url, _headers(token), timeout_s + wait_s, ca_file)
 
     def deliver(self, parcel: Parcel) -> float:
         """Return when the twin has the message safe; see `Transport`."""
@@ -285,7 +131,7 @@ class HttpTransport:
         # A proxy's login page has status 200 too: only the acknowledgement itself counts.
         if not any(_is(expected, data) for data in _decode_list(response.body)):
             raise Unreachable("the answer to a window does not acknowledge it: whoever answers is not the twin")
-        return _older_pause_s(response.older_pause)
+        return _older_pause_s(response.headers.get(OLDER_PAUSE, ""))
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
@@ -319,19 +165,15 @@ class HttpTransport:
         self._down.close()
 
 
+def _headers(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}", "Accept": BODY}
+
+
 def _claimed(claim: HeldClaim) -> dict[str, str]:
     return {CLAIM: claim.text} if claim.number else {}
 
 
-def _shut(connection: HTTPConnection) -> None:
-    """Wake the thread that waits for a response on a connection."""
-    try:
-        connection.sock.shutdown(socket.SHUT_RDWR)
-    except OSError:
-        return
-
-
-def _checked(response: _Response, good: tuple[int, ...], mark: str | None = None) -> _Response:
+def _checked(response: HttpAnswer, good: tuple[int, ...], mark: str | None = None) -> HttpAnswer:
     """Return a response whose status is good; raise `Refused` or `Unreachable` for any other.
 
     Only a reason code of the twin refuses a message; any other error, as of a proxy, means that the twin is out of
@@ -349,10 +191,10 @@ def _checked(response: _Response, good: tuple[int, ...], mark: str | None = None
     judged = refusal.code.temporary or refusal.code is Refusal.TOO_LARGE or mark in (None, refusal.mark)
     if not judged:
         raise Unreachable(f"{_OTHER_BODY} ({refusal.code.value}: {refusal.detail[:200]})")
-    raise Refused(refusal.code, refusal.detail[:200], _retry_after_s(response.retry_after))
+    raise Refused(refusal.code, refusal.detail[:200], _retry_after_s(response.headers.get("Retry-After", "")))
 
 
-def _refusal_body(response: _Response) -> _RefusalBody | None:
+def _refusal_body(response: HttpAnswer) -> _RefusalBody | None:
     """Read the body of a refusal; None: it has none of the twin's."""
     try:
         return msgspec.json.decode(response.body[:_LONGEST_ERROR], type=_RefusalBody)
@@ -360,7 +202,7 @@ def _refusal_body(response: _Response) -> _RefusalBody | None:
         return None
 
 
-def _refusal_of(response: _Response) -> Refusal | None:
+def _refusal_of(response: HttpAnswer) -> Refusal | None:
     body = _refusal_body(response)
     return None if body is None else body.code
 

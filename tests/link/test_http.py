@@ -5,7 +5,10 @@ import ssl
 import threading
 import time
 import zlib
+from contextlib import ExitStack, closing
 from pathlib import Path
+from queue import Empty, Queue
+from typing import Any
 
 import pytest
 from faketwin import FakeTwin, Handler
@@ -179,26 +182,68 @@ def test_closing_ends_a_poll_under_way(twin: FakeTwin) -> None:
     link.close()
 
 
-def test_a_connection_made_while_the_link_closes_is_closed(twin: FakeTwin, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_is_closed_while_it_looks_up_a_name_connects_no_more(
+    twin: FakeTwin, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The socket does not exist yet when `close` looks for it."""
-    connecting, closed, made = threading.Event(), threading.Event(), []
-    connect = socket.create_connection
+    asked, closed, look_up = threading.Event(), threading.Event(), socket.getaddrinfo
 
-    def slowly(*args: object, **options: object) -> socket.socket:
-        connecting.set()
+    def slowly(*args: Any, **options: Any) -> Any:
+        asked.set()
         assert closed.wait(10.0)
-        made.append(connect(*args, **options))  # type: ignore[arg-type]
-        return made[-1]
+        return look_up(*args, **options)
 
-    monkeypatch.setattr(socket, "create_connection", slowly)
-    link = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
-    thread = threading.Thread(target=link.deliver, args=(parcel(0),))
+    monkeypatch.setattr(socket, "getaddrinfo", slowly)
+    link, ended = HttpTransport(twin.url, "axis-1", "secret"), Queue[Exception]()
+    thread = threading.Thread(target=_deliver, args=(link, ended))
     thread.start()
-    assert connecting.wait(10.0)
+    assert asked.wait(10.0)
     link.close()
     closed.set()
-    thread.join(10.0)
-    assert made[0].fileno() == -1
+    assert str(ended.get(timeout=10.0)) == "the link is closed"
+    thread.join()
+    assert twin.windows == {}
+
+
+def test_closing_ends_a_connection_that_nobody_answers() -> None:
+    """A firewall that swallows packets held an edge that was told to stop until it was killed, 10 s later."""
+    with socket.socket() as full, ExitStack() as waiting:
+        full.bind(("127.0.0.1", 0))
+        full.listen(0)
+        for _ in range(3):  # then its queue is full, and a further connection hears nothing
+            connection = waiting.enter_context(socket.socket())
+            connection.setblocking(False)
+            connection.connect_ex(full.getsockname())
+        link, ended = HttpTransport(f"http://127.0.0.1:{full.getsockname()[1]}", "axis-1", "x"), Queue[Exception]()
+        thread = threading.Thread(target=_deliver, args=(link, ended))
+        thread.start()
+        with pytest.raises(Empty):
+            ended.get(timeout=0.3)
+        link.close()
+        assert isinstance(ended.get(timeout=5.0), Unreachable)
+        thread.join()
+
+
+def test_the_next_address_is_tried_where_one_does_not_answer(twin: FakeTwin, monkeypatch: pytest.MonkeyPatch) -> None:
+    look_up = socket.getaddrinfo
+
+    def two(host: str, port: int, **options: Any) -> Any:
+        with socket.socket() as unused:
+            unused.bind(("127.0.0.1", 0))
+            nobody = unused.getsockname()[1]
+        return [*look_up(host, nobody, **options), *look_up(host, port, **options)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", two)
+    with closing(HttpTransport(twin.url, "axis-1", "secret")) as link:
+        link.deliver(parcel(0))
+    assert len(twin.windows) == 1
+
+
+def _deliver(link: HttpTransport, ended: "Queue[Exception]") -> None:
+    try:
+        link.deliver(parcel(0))
+    except Exception as error:
+        ended.put(error)
 
 
 def test_deflate_is_used_where_it_helps() -> None:
