@@ -20,7 +20,9 @@ _NO_TLS = ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LO
 """Parts of OpenSSL's reasons; which one it gives for an answer that is not TLS depends on its version."""
 
 
-def cause_of(error: object, encrypted: bool, ca: str | Path | None, key: str = "ca_file") -> str:
+def cause_of(
+    error: object, encrypted: bool, ca: str | Path | None, key: str = "ca_file", answered: bool = False
+) -> str:
     """Name the cause of a failed connection.
 
     Parameters
@@ -33,11 +35,14 @@ def cause_of(error: object, encrypted: bool, ca: str | Path | None, key: str = "
         File of the certificates that are trusted; None: the system's.
     key : str
         Key or option that gives that file.
+    answered : bool
+        The server has answered before, so that it is one without TLS where the connection is.
     """
     if not encrypted:
         # Before a version of TLS is agreed on, a server ends the connection, or answers with an alert.
         hint = ": where its port is one with TLS, url begins with https://"
-        return _named(error) + (hint if isinstance(error, ConnectionResetError | BadStatusLine) else "")
+        doubtful = not answered and isinstance(error, ConnectionResetError | BadStatusLine)
+        return _named(error) + (hint if doubtful else "")
     code, detail = getattr(error, "verify_code", 0), getattr(error, "verify_message", "")
     if code in (_NOT_YET, _EXPIRED):
         state = "has expired" if code == _EXPIRED else "is not yet valid"

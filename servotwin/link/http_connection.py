@@ -115,7 +115,7 @@ class PersistentConnection:
         self._context = tls_context(ca_file) if is_encrypted(url) else None
         self._headers = headers
         self._connection: _PlainConnection | None = None
-        self._closed, self._busy = False, Lock()
+        self._answered, self._closed, self._busy = False, False, Lock()
 
     def request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpAnswer:
         """Send one request and return its response, of `limit` bytes at most; raises Unreachable."""
@@ -135,7 +135,8 @@ class PersistentConnection:
             self.drop()
             # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
             if fresh or isinstance(error, TimeoutError):
-                raise Unreachable(cause_of(error, self._context is not None, self._ca_file)) from None
+                encrypted = self._context is not None
+                raise Unreachable(cause_of(error, encrypted, self._ca_file, answered=self._answered)) from None
         return self._request(method, path, body, headers, limit)
 
     def drop(self) -> None:
@@ -172,6 +173,7 @@ class PersistentConnection:
         deadline = self._clock() + self._timeout
         connection.request(method, self._parts.path.rstrip("/") + path, body, {**self._headers, **headers})
         response = connection.getresponse()
+        self._answered = True
         data = self._read(response, limit, deadline)
         if response.will_close:
             self.drop()

@@ -239,6 +239,25 @@ def test_the_next_address_is_tried_where_one_does_not_answer(twin: FakeTwin, mon
     assert len(twin.windows) == 1
 
 
+def test_a_twin_that_has_answered_and_is_killed_is_not_said_to_want_tls() -> None:
+    ended = Queue[Exception]()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = HttpTransport(f"http://127.0.0.1:{server.getsockname()[1]}", "axis-1", "x")
+        for answer, word in ((b"HTTP/1.1 503 busy\r\nContent-Length: 0\r\n\r\n", "503"), (b"", "reset")):
+            thread = threading.Thread(target=_deliver, args=(link, ended))
+            thread.start()
+            with server.accept()[0] as connection:
+                connection.recv(100)
+                connection.sendall(answer)
+                if not answer:
+                    connection.close()  # with bytes that were not read: a reset
+                said = str(ended.get(timeout=5.0))
+            thread.join()
+            assert word in said
+            assert "TLS" not in said
+    link.close()
+
+
 def _deliver(link: HttpTransport, ended: "Queue[Exception]") -> None:
     try:
         link.deliver(parcel(0))
