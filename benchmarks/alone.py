@@ -85,7 +85,7 @@ def run_alone(
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
     `full` applies to those of `FULL`: the full length of the documented figures. `seed` applies to those of `SEEDED`,
-    `minutes` and `servos` to the endurance.
+    `minutes` to the endurance, `servos` to that and the fleet.
 
     Raises
     ------
@@ -99,8 +99,8 @@ def run_alone(
         raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
     if minutes is not None and list(names) != [endurance.NAME]:
         raise InvalidInput(f"--minutes: only bench {endurance.NAME} takes it")
-    if servos is not None and list(names) != [endurance.NAME]:
-        raise InvalidInput(f"--servos: only bench {endurance.NAME} takes it")
+    if servos is not None and list(names) not in ([endurance.NAME], [whole.NAME]):
+        raise InvalidInput(f"--servos: only bench {endurance.NAME} or {whole.NAME} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:
@@ -108,6 +108,8 @@ def run_alone(
     chosen = ALONE[name]
     scale = FULL[name] if full else chosen.quick if quick else chosen.whole
     scale = scale if minutes is None else minutes
+    if isinstance(scale, FleetScale) and servos is not None:
+        scale, servos = scale.of(servos), None
     chosen_by_user = {"seed": seed, "servos": servos}
     chosen.run(date, output, scale, **{name: value for name, value in chosen_by_user.items() if value is not None})
     return True

@@ -32,7 +32,8 @@ def bench(
     ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="endurance: length; 10 by default.")] = None,
     servos: Annotated[
-        int | None, typer.Option(min=4, help="endurance: servos; 4 by default, which have edges, the others none.")
+        int | None,
+        typer.Option(min=4, help="Servos. endurance: 4 by default, which have edges, the others none; fleet: 10 000."),
     ] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,

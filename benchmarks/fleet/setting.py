@@ -100,6 +100,10 @@ class FleetScale:
         """The full bench: five minutes, and an outage of ten."""
         return replace(self, steady=300.0, outage=600.0, after=600.0)
 
+    def of(self, servos: int) -> FleetScale:
+        """The same of another number of servos, each of which sends as often."""
+        return replace(self, servos=servos, rate=self.rate * servos / self.servos)
+
 
 QUICK = FleetScale(200, 20.0, 0.1, 3.0, 1.0, 2.0, 1.0, 2, 2, 1, 4)
 

@@ -59,3 +59,13 @@ def test_document(tmp_path, monkeypatch: pytest.MonkeyPatch):
 def test_only_some_take_a_seed():
     with pytest.raises(InvalidInput, match="--seed: only bench windows, loops, certificates or endurance"):
         alone.run_alone(("estimator",), "", None, True, False, seed=3)
+
+
+def test_a_fleet_of_another_size_has_the_same_cadence(monkeypatch):
+    chosen = []
+    bench = alone.ALONE["fleet"]._replace(run=lambda _date, _output, scale: chosen.append(scale))
+    monkeypatch.setattr(alone, "ALONE", {**alone.ALONE, "fleet": bench})
+    assert alone.run_alone(("fleet",), "", None, False, False, full=True, servos=3000)
+    assert (chosen[0].servos, chosen[0].rate, chosen[0].outage) == (3000, 150.0, 600.0)
+    with pytest.raises(InvalidInput, match="--servos: only bench endurance or fleet takes it"):
+        alone.run_alone(("windows",), "", None, True, False, servos=30)
