@@ -201,12 +201,16 @@ def test_pages_are_accessible_and_fit_every_width(open_page, twin):
     has_text(machine, "[aria-label=Residual] p", "95 % band")
     for view, page in (("fleet", fleet), ("machine", machine), ("login", login)):
         page.bring_to_front()
+        heights = {}
         for look, width in looks(page):
             if view == "machine":
                 stream_live(twin, page)
             picture = page.screenshot(full_page=view == "machine")
             (PICTURES / f"{view}-{look}.png").write_bytes(picture)
             assert page.evaluate("document.documentElement.scrollWidth") <= width, f"{view} scrolls sideways, {look}"
+            # On a machine's page times since its messages may need another line meanwhile.
+            height = page.evaluate("document.documentElement.scrollHeight") if view != "machine" else 0
+            assert heights.setdefault(width, height) == height, f"{view}: the theme moves something, {look}"
             if width < 3840:
                 assert serious_faults(page) == []
 
