@@ -6,6 +6,7 @@ scipy.signal takes most of a second to import, so only what draws noise imports 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -60,12 +61,7 @@ class Noise:
             raise InvalidInput(
                 f"noise band = {self.band} Hz: the pass edge must be below half the sample rate of {rate} Hz"
             )
-        from scipy import signal
-
-        order, edge = signal.buttord(passed, stop, PASSBAND_RIPPLE_DB, STOPBAND_ATTENUATION_DB, fs=rate)
-        sections: Array = signal.butter(order, edge, "highpass", output="sos", fs=rate)
-        sections[0, :3] /= noise_gain(sections)
-        return sections
+        return _high_pass(stop, passed, rate).copy()
 
     def source(self, rate: float, rng: np.random.Generator) -> NoiseSource:
         """A source of consecutive blocks, stationary from its first sample."""
@@ -86,6 +82,17 @@ class Noise:
             The only randomness used.
         """
         return self.source(rate, rng).block(n)
+
+
+@lru_cache(maxsize=64)
+def _high_pass(stop: float, passed: float, rate: float) -> Array:
+    """Sections of a filter of unit noise gain; all are Hz."""
+    from scipy import signal
+
+    order, edge = signal.buttord(passed, stop, PASSBAND_RIPPLE_DB, STOPBAND_ATTENUATION_DB, fs=rate)
+    sections: Array = signal.butter(order, edge, "highpass", output="sos", fs=rate)
+    sections[0, :3] /= noise_gain(sections)
+    return sections
 
 
 @dataclass

@@ -9,10 +9,9 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.kernel import FULL
-from servotwin.hybrid.response import BlockResponses, build_responses, new_response_memory, output_responses
+from servotwin.hybrid.response import TICKS, BlockResponses, build_responses, new_response_memory, output_responses
 from servotwin.hybrid.trajectory import tables_for
 from servotwin.simulation.plant_blocks import (
-    LAW_STATES,
     more_blocks,
     new_blocks,
     note_block,
@@ -63,7 +62,7 @@ class PlantBlockEngine(SampledEngine):
         n, port = len(self.state), self.port
         self.responses = _responses_for(self.plant.automaton, self.step, port.searches, port.voltage, port.position)
         self.memory = new_response_memory(self.responses, n)
-        self.law_states = np.zeros(LAW_STATES)
+        self.commands = np.zeros(TICKS)
         self.blocks = new_blocks(n, _ROOM)
 
     def _recorded(self) -> list[int]:
@@ -94,7 +93,7 @@ class PlantBlockEngine(SampledEngine):
                 self.blocks,
                 self.scratch,
                 self.memory,
-                self.law_states,
+                self.commands,
             )
             if status == FULL and self.blocks.size[0] == len(self.blocks.tick):
                 self.blocks = more_blocks(self.blocks)

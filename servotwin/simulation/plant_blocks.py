@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from servotwin.control.law import LawParameters, LawState
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.response import (
@@ -25,9 +25,6 @@ from servotwin.hybrid.response import (
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.ticks import Output, Port, TickInputs, in_turn, measured, tick_between
 
-_LAW = len(LawState._fields)
-LAW_STATES = _LAW * TICKS
-"""Numbers of the law's states after the ticks of a block."""
 _UNNOTED = 64
 """Blocks after which a start is recorded anew: `sample_blocks` makes the states between, up to rounding."""
 
@@ -69,23 +66,22 @@ def note_block(blocks: PlantBlocks, tick: int, mode: int, x: Array) -> None:
     blocks.size[0] = at + 1
 
 
-@inlined
-def store(state: LawState, law_states: Array, j: int) -> None:
-    """Keep the law's state after a tick of the block."""
-    at = np.uint64(j) * np.uint64(_LAW)
-    law_states[at], law_states[at + np.uint64(1)] = state.integral, state.derivative
-    law_states[at + np.uint64(2)], law_states[at + np.uint64(3)] = state.filtered, state.voltage
-    law_states[at + np.uint64(4)], law_states[at + np.uint64(5)] = state.active, state.offset
-    law_states[at + np.uint64(6)], law_states[at + np.uint64(7)] = state.reference, state.ahead
-    law_states[at + np.uint64(8)] = state.direction
-    law_states[at + np.uint64(9)], law_states[at + np.uint64(10)] = state.notch_band, state.notch_low
-
-
-@inlined
-def stored(law_states: Array, j: int) -> LawState:
-    """The law's state after a tick of the block."""
-    s = law_states[j * _LAW : j * _LAW + _LAW]
-    return LawState(s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10])
+@subroutine
+def after_ticks(
+    tick: int,
+    count: int,
+    parameters: LawParameters,
+    state: LawState,
+    tick_inputs: TickInputs,
+    output: Output,
+) -> LawState:
+    """The law's state after the first ticks of a block, from that before it: they are taken once more."""
+    for i in range(tick, tick + count):
+        k = i - tick_inputs.first
+        zone, reference = k & tick_inputs.zone_mask, tick_inputs.reference[k & tick_inputs.reference_mask]
+        y = output.measured[i - output.first_tick]
+        state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
+    return state
 
 
 @inlined
@@ -100,7 +96,7 @@ def take_ticks(
     tick_inputs: TickInputs,
     output: Output,
     memory: ResponseMemory,
-    law_states: Array,
+    commands: Array,
     recent: float,
 ) -> LawState:
     """The ticks of a block, one after the other, as if no guard fired."""
@@ -117,11 +113,10 @@ def take_ticks(
         y = measured(position, tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)], port)
         reference = tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)]
         state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
-        store(state, law_states, j)
-        voltage = state.voltage
+        voltage = commands[j] = state.voltage
         if delay > 0:
             early = int(j) < delay
-            voltage = port.delayed[(tick + int(j)) % delay] if early else law_states[(int(j) - delay) * _LAW + 3]
+            voltage = port.delayed[(tick + int(j)) % delay] if early else commands[int(j) - delay]
         voltages[j], positions[j], measurements[j] = voltage, position, y
         actives[j] = 1 if state.active > 0.5 else 0
         hold_input(r, mode, j, voltage, memory)
@@ -145,7 +140,7 @@ def run_plant_blocks(
     blocks: PlantBlocks,
     scratch: Scratch,
     memory: ResponseMemory,
-    law_states: Array,
+    commands: Array,
 ) -> tuple[int, int, int, LawState]:
     """Run ticks `tick` .. `end` - 1; return status, the next tick, mode and law state. Stops early when a record is
     full."""
@@ -163,17 +158,16 @@ def run_plant_blocks(
         count = min(TICKS, end - tick)
         for j in range(count, TICKS):
             memory.start[t.states + j] = 0.0
-        state = take_ticks(
-            r, tick, count, mode, parameters, state, port, tick_inputs, output, memory, law_states, recent
-        )
+        before = state
+        state = take_ticks(r, tick, count, mode, parameters, state, port, tick_inputs, output, memory, commands, recent)
         calm = calm_ticks(t, r, mode, count, x, memory)
         end_block(r, mode, calm, x, memory)
         last = min(calm, count - 1)
         if calm < count:
-            state = stored(law_states, last)
+            state = after_ticks(tick, last + 1, parameters, before, tick_inputs, output)
             x[port.voltage] = output.states[0, tick + last - output.first_sample]
         for j in range(last + 1 if port.delayed.size > 0 else 0):
-            in_turn(tick + j, law_states[j * _LAW + 3], port.delayed)
+            in_turn(tick + j, commands[j], port.delayed)
         tick += calm
         fresh = calm < TICKS
         recent = 0.0 if fresh else output.states[0, tick - 1 - output.first_sample]
