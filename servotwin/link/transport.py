@@ -38,8 +38,8 @@ class Parcel(NamedTuple):
         return self.boot != ""
 
 
-LONGEST_OLDER_PAUSE_S = 30.0
-"""Longest pause before an older window, s: the time within which a fleet's newest windows are to be looked at."""
+LONGEST_OLDER_PAUSE_S = 60.0
+"""Longest pause before an older window to which an edge agrees, s."""
 
 
 class Unreachable(Exception):

@@ -8,12 +8,13 @@ each window that a newer one has overtaken. The newest window never waits for th
 from dataclasses import dataclass
 from typing import TypeVar
 
-_FRESH_S = 10.0
+FRESH_S = 10.0
 """s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that
 the twin asks for go after it from the start: of each of a fleet's edges a single one would hold up all newest ones."""
-_IN_A_ROW = 2
+_IN_A_ROW = 4
 """Newest windows in a row after which a first older one goes whatever the pause; from then on one after each newest.
-However slow the twin is, a backlog does not grow, and is gone in the time in which it arose."""
+However slow the twin is, a backlog hardly grows, and is gone in the time in which it arose. After two already, the
+older windows of a fleet with windows of 20 s came before the newest ones were looked at."""
 _Window = TypeVar("_Window")
 
 
@@ -61,7 +62,7 @@ class WindowOrder:
             return first
         if self._held_up_since is None:
             self._held_up_since = now
-        held_up = older * self.pause_s > _FRESH_S or now - self._held_up_since >= _FRESH_S
+        held_up = older * self.pause_s > FRESH_S or now - self._held_up_since >= FRESH_S
         if self._in_a_row >= _IN_A_ROW or not held_up:
             return first
         self._held_up_since = now
