@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -39,15 +40,20 @@ def bench(
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
 ) -> None:
     """Measure speed and accuracy beside other solvers."""
-    from datetime import UTC, datetime
+    # A benchmark that is told to end must end the processes that it has started, as after Ctrl-C.
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        from datetime import UTC, datetime
 
-    from benchmarks.alone import run_alone
+        from benchmarks.alone import run_alone
 
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    others = slow or runs is not None or reference is not None
-    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed, minutes, servos):
-        return
-    from benchmarks.catalogue import Options
-    from benchmarks.command import bench as run
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        others = slow or runs is not None or reference is not None
+        if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed, minutes, servos):
+            return
+        from benchmarks.catalogue import Options
+        from benchmarks.command import bench as run
 
-    run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
+        run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
+    finally:
+        signal.signal(signal.SIGTERM, former)

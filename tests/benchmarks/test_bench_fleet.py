@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -376,3 +377,20 @@ def test_the_bench_of_a_store_counts_what_its_rounds_did(tmp_path: Path) -> None
         few, many = (cost.statements[what] for cost in costs)
         assert 0 < 2 * few == many
         assert all(cost.seconds[what] > 0.0 for cost in costs)
+
+
+def test_a_bench_that_is_terminated_cleans_up_as_after_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = list[str]()
+
+    def run(*_arguments: object) -> bool:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10.0)
+        finally:
+            ended.append("cleaned up")
+        return True
+
+    monkeypatch.setattr("benchmarks.alone.run_alone", run)
+    assert CliRunner().invoke(app, ["bench", "fleet"]).exit_code == 130
+    assert ended == ["cleaned up"]
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
