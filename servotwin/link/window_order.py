@@ -12,9 +12,8 @@ FRESH_S = 10.0
 """s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that
 the twin asks for go after it from the start: of each of a fleet's edges a single one would hold up all newest ones."""
 _IN_A_ROW = 4
-"""Newest windows in a row after which a first older one goes whatever the pause; from then on one after each newest.
-However slow the twin is, a backlog hardly grows, and is gone in the time in which it arose. After two already, the
-older windows of a fleet with windows of 20 s came before the newest ones were looked at."""
+"""Newest windows in a row after which an older one goes whatever the pause: however slow the twin is, a backlog shrinks.
+With one after each newest a fleet of a busy twin kept its newest windows waiting until all of the backlog was in."""
 _Window = TypeVar("_Window")
 
 
@@ -91,7 +90,7 @@ class WindowOrder:
         if not older:
             self._older_from, self._in_a_row = None, 0
         elif not fresh:
-            self._older_from, self._in_a_row = now + pause_s, _IN_A_ROW - 1
+            self._older_from, self._in_a_row = now + pause_s, 0
         else:
             # A pause goes on while newest windows come: begun anew by each of them it would never end.
             self._older_from = now + pause_s if self._older_from is None else self._older_from

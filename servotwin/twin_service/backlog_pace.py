@@ -13,21 +13,22 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import TypeVar
 
+from servotwin.link.transport import LONGEST_OLDER_PAUSE_S
 from servotwin.link.window_order import FRESH_S
 from servotwin.store.engine import StoreUnavailable
 from servotwin.twin_service.limits import MAX_SERVOS
 
 NEWEST_S = 30.0
-"""s that the newest windows of a fleet have for themselves once its link is back, and longest pause from then on."""
+"""s that the newest windows of a fleet have for themselves once its link is back."""
 _FIRST_SPREAD = 0.5
 """Part of that time over which the first older windows of a fleet are spread: its edges come back at once."""
 LOOK_S = 2.0
 """s between two looks at the lag while edges have backlogs."""
 _SHORTEST_PAUSE_S = 1.0
 """Where all edges with a backlog send a window within this time, s, nothing is gained by a pause."""
-_FIRST_SHARE, _LEAST_SHARE, _FIRST_WORK_S = 0.5, 0.25, 1e-3
+_FIRST_SHARE, _LEAST_SHARE, _FIRST_WORK_S = 0.25, 0.05, 1e-3
 """Share of the workers' capacity at which older windows are asked for at first, and at least, however long new messages
-wait; and s of work for one window until that is measured."""
+wait; and s of work for one window until that is measured. New ones need the workers too, and all need the store."""
 _LEAST_PER_S = 50.0
 """Older windows/s that are always asked for: storing these takes a few percent of a core."""
 _LAG, _LONGEST_LAG_S = 0.1, 3.0
@@ -35,7 +36,7 @@ _LAG, _LONGEST_LAG_S = 0.1, 3.0
 _MUCH_FASTER, _FASTER, _SLOWER = 2.0, 1.2, 0.7
 """Factors of the rate at each change: where new messages wait for less than a third of that time, for less than all of
 it, and for longer."""
-_FORGET_S, _GONE_S = 3600.0, 2.0 * NEWEST_S
+_FORGET_S, _GONE_S = 3600.0, 2.0 * LONGEST_OLDER_PAUSE_S
 """s without a window after which a servo does not count as one of the fleet, and after which it has no backlog."""
 
 _Value = TypeVar("_Value")
@@ -94,7 +95,7 @@ class BacklogPace:
         now = self._now()
         _note(self._fleet, servo, now)
         _forget(self._fleet, now, _FORGET_S)
-        whole = min(len(self._fleet) / self._first_rate, NEWEST_S)
+        whole = min(len(self._fleet) / self._first_rate, LONGEST_OLDER_PAUSE_S)
         if not waiting:
             self._behind.pop(servo, None)
             return _told(whole)
@@ -137,7 +138,7 @@ class BacklogPace:
         if not self.behind or now - self._changed < self._pause:  # the edges have not followed the last change yet
             return
         faster = _MUCH_FASTER if seconds <= self._lag / 3.0 else _FASTER
-        least = max(self._capacity * _LEAST_SHARE, _LEAST_PER_S, self.behind / NEWEST_S)
+        least = max(self._capacity * _LEAST_SHARE, _LEAST_PER_S, self.behind / LONGEST_OLDER_PAUSE_S)
         self._rate = max(self._rate * (faster if seconds <= self._lag else _SLOWER), least)
         self._changed = now
 
@@ -153,12 +154,12 @@ class BacklogPace:
 
     @property
     def _pause(self) -> float:
-        return min(self.behind / self._rate, NEWEST_S)
+        return min(self.behind / self._rate, LONGEST_OLDER_PAUSE_S)
 
 
 def _told(pause: float) -> float:
     """Pause (s) as an edge is told, where it is worth one."""
-    return min(pause, NEWEST_S) if pause >= _SHORTEST_PAUSE_S else 0.0
+    return min(pause, LONGEST_OLDER_PAUSE_S) if pause >= _SHORTEST_PAUSE_S else 0.0
 
 
 def _note(servos: OrderedDict[str, _Value], servo: str, value: _Value) -> None:
