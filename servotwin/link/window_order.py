@@ -12,8 +12,8 @@ FRESH_S = 10.0
 """s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that
 the twin asks for go after it from the start: of each of a fleet's edges a single one would hold up all newest ones."""
 _IN_A_ROW = 4
-"""Newest windows in a row after which an older one goes whatever the pause: however slow the twin is, a backlog shrinks.
-With one after each newest a fleet of a busy twin kept its newest windows waiting until all of the backlog was in."""
+"""Newest windows in a row after which an older one goes whatever the pause, so that a backlog shrinks however slow the
+twin is. With one after each newest a fleet of a busy twin kept its newest windows waiting until all of it was in."""
 _Window = TypeVar("_Window")
 
 

@@ -72,7 +72,7 @@ class Lender:
             yield LeaseResult(made, "it failed", 19.0 if body == TAKES_LONG else 0.0)
 
 
-def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
+def through(turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace | None = None) -> Lender:
     """All turns, one after the other."""
 
     async def commit(_outcome: WorkResult) -> bool:
@@ -90,7 +90,7 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
             clocks=Clocks(),
             owner="me",
             quota=VerificationQuota(0.0),
-            pace=WorkPace(0.5),
+            pace=pace or WorkPace(0.5),
         )
 
         async def one_by_one() -> "Lender":
@@ -154,6 +154,14 @@ def test_a_lease_is_renewed_for_as_long_as_a_worker_is_at_work(monkeypatch):
 def test_a_servo_that_took_long_lets_the_others_come_first(monkeypatch):
     monkeypatch.setattr(dispatching, "LEASE_S", 0.01)
     assert through([[claim("a"), claim("b", TAKES_LONG)]]).held == ["b"]
+
+
+def test_a_letter_that_takes_no_time_tells_nothing_of_windows(monkeypatch):
+    """After a quiet hour with letters alone a fleet's backlog would be asked for far too fast."""
+    monkeypatch.setattr(dispatching, "LEASE_S", 0.01)
+    pace = WorkPace()
+    through([[claim("a", TAKES_LONG)], *([claim("b", kind=MessageKind.LETTER)] for _ in range(20))], pace=pace)
+    assert pace.seconds == 19.0
 
 
 def test_jobs_are_as_large_as_the_work_is_quick():
