@@ -48,6 +48,12 @@ class BacklogWork(NamedTuple):
     processed: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+_JUDGED = (
+    " AND EXISTS (SELECT 1 FROM evidence WHERE message = messages.id"
+    " AND (kind = 'estimate' OR status = 'nothing moved'))"
+)
+
+
 @contextmanager
 def reading(file: Path) -> Iterator[sqlite3.Connection]:
     """Open the store's file read-only, beside the twin."""
@@ -87,12 +93,15 @@ def done(connection: sqlite3.Connection, since: float, until: float) -> Processe
     )
 
 
-def fresh(connection: sqlite3.Connection, start: float, returned: float) -> list[float]:
+def fresh(connection: sqlite3.Connection, start: float, returned: float, judged: bool = False) -> list[float]:
     """Time from the return of the link, at `returned` (s since the epoch), until a window of each servo has an outcome
     that starts at `start` (s of sample time) or later; rising, s.
+
+    `judged`: a window that was estimated or in which nothing had moved, not one that a newer one has overtaken.
     """
-    query = "SELECT min(done) FROM messages WHERE kind = 'window' AND start >= ? AND done IS NOT NULL GROUP BY servo"
-    return sorted(float(at) - returned for (at,) in connection.execute(query, (start,)))
+    query = "SELECT min(done) FROM messages WHERE kind = 'window' AND start >= ? AND done IS NOT NULL"
+    rows = connection.execute(query + (_JUDGED if judged else "") + " GROUP BY servo", (start,))
+    return sorted(float(at) - returned for (at,) in rows)
 
 
 def worked_off(connection: sqlite3.Connection, begin: float, end: float, returned: float) -> BacklogWork:

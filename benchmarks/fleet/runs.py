@@ -48,6 +48,8 @@ class FleetRun(NamedTuple):
         s from when the link came back until the first window of a servo was processed that was cut in the last period
         before that or later, rising: of each servo with such a window.
     backlog : BacklogWork
+    judged : tuple of float
+        As `fresh`, but until such a window was estimated, or nothing had moved in it.
     """
 
     report: LoadReport
@@ -58,6 +60,7 @@ class FleetRun(NamedTuple):
     drained: float
     fresh: tuple[float, ...] = ()
     backlog: BacklogWork = BacklogWork()
+    judged: tuple[float, ...] = ()
 
 
 def ingest(
@@ -115,12 +118,13 @@ def _run(
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        fresh, backlog, (begin, end) = tuple[float, ...](), BacklogWork(), plan.outage
+        fresh, judged, backlog, (begin, end) = tuple[float, ...](), tuple[float, ...](), BacklogWork(), plan.outage
         if end > 0.0:
             # The edges begin when they are connected: by a fraction of a second later than `since`.
-            fresh = tuple(findings.fresh(store, plan.start + end - plan.servos / plan.rate, since + end))
+            newest = plan.start + end - plan.servos / plan.rate
+            fresh, judged = (tuple(findings.fresh(store, newest, since + end, own)) for own in (False, True))
             backlog = findings.worked_off(store, plan.start + begin, plan.start + end, since + end)
-        return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh, backlog)
+        return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh, backlog, judged)
 
 
 def _watched(

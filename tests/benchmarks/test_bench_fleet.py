@@ -34,7 +34,7 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.redesign.certified.lookup import Grid
-from servotwin.store.records import Incoming, MessageKind, WorkResult
+from servotwin.store.records import EvidenceRecord, Incoming, MessageKind, WorkResult
 from servotwin.store.store import open_store
 from servotwin.twin.state import TwinState, Versions
 
@@ -316,12 +316,16 @@ def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
             assert (found.windows, found.undone) == (2, 2)
             assert findings.fresh(reading, 2.0, 100.0) == []
             lease = store.lease("me", 1, 60.0, 110.0)[0]
-            store.commit([WorkResult("a", lease.serial, b"", None, tuple(m.id for m in lease.messages))], 125.0)
+            newest = EvidenceRecord("estimate", lease.messages[-1].id, b"")
+            done = WorkResult("a", lease.serial, b"", None, tuple(m.id for m in lease.messages), evidence=(newest,))
+            store.commit([done], 125.0)
             assert findings.fresh(reading, 2.0, 100.0) == [25.0]
             assert findings.fresh(reading, 4.0, 100.0) == []
+            assert findings.fresh(reading, 2.0, 100.0, judged=True) == [25.0]
+            assert findings.fresh(reading, 3.5, 100.0, judged=True) == []
             off = findings.worked_off(reading, 1.0, 3.0, 100.0)
             assert (off.windows, off.undone, off.came[2], off.processed[2]) == (2, 0, 2.0, 25.0)
-            assert findings.made(reading, 0.0) == {}
+            assert findings.made(reading, 0.0) == {"estimate": 1}
             assert findings.failures(reading) == []
     finally:
         store.close()
