@@ -79,6 +79,18 @@ def test_older_windows_come_faster_while_new_ones_do_not_wait_and_slower_while_t
     assert slower[-1] == pytest.approx(20.0)
 
 
+def test_an_edge_that_always_has_a_backlog_says_nothing_of_a_whole_fleets() -> None:
+    """The rate rose at every look, to 1e300 within the hour, and a fleet that came back got no pause."""
+    machine = Machine()
+    machine.rush(4000, waiting=0)
+    for _ in range(1800):
+        machine.now += LOOK_S
+        machine.pace.pause("ax-7", 1)
+        machine.pace.note_lag(0.0)
+    machine.rush(4000)
+    assert machine.rush(4000)[-1] == pytest.approx(8.0)
+
+
 def test_an_edge_without_a_backlog_is_told_what_the_whole_fleet_would_need() -> None:
     machine = Machine()
     machine.rush(4000, waiting=0)
