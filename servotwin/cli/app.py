@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Annotated, Any, cast
 
 import typer
@@ -79,7 +80,8 @@ app = typer.Typer(
 
 
 def _end(message: str, code: int) -> None:
-    print(message, file=sys.stderr)
+    with suppress(OSError):  # a log on a full disk: the code still says it
+        print(message, file=sys.stderr, flush=True)
     raise typer.Exit(code) from None
 
 

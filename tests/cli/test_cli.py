@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -209,3 +210,10 @@ def test_the_estimator_s_bench_takes_no_option_that_it_ignores():
     for words in (["W1"], ["--runs", "3"], ["--slow"]):
         result = run("bench", "estimator", *words)
         assert result.exit_code == 2, words
+
+
+def test_an_error_that_cannot_be_written_still_has_its_exit_code() -> None:
+    """The log of a twin that starts on a full disk."""
+    with Path("/dev/full").open("wb") as full:
+        ended = subprocess.run([sys.executable, "-m", "servotwin", "simulate", "nosuch.toml"], stderr=full)
+    assert ended.returncode == 2
