@@ -10,12 +10,14 @@ import time
 from array import array
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import msgspec
 
-from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.runtime.files import replace_file
+
+if TYPE_CHECKING:
+    from servotwin.link.sqlite_outbox import SqliteOutbox
 
 _STATUS_SCHEMA = "servotwin-edge-status/1"
 _FORMER = "not tried again since the link process was started anew; before: "

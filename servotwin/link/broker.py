@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
-from servotwin.link.connection_errors import cause_of, is_of_certificate
 from servotwin.link.url import read_again, tls_context
 from servotwin.runtime.extras import missing_extra
 
@@ -216,6 +215,9 @@ class Connection:
         self._up = self._answered = False
 
     def _failed(self, _client: Client, _user: Any) -> None:
+        # Here, as ssl in `url`: the edge's control process, which knows brokers from its file only, does without it.
+        from servotwin.link.connection_errors import cause_of, is_of_certificate
+
         # paho calls this while it handles the exception, which it does not pass on.
         error, broker = sys.exc_info()[1], self._broker
         if self._context is not None and is_of_certificate(error):

@@ -79,3 +79,13 @@ def test_no_module_of_the_edge_imports_numpy_even_late() -> None:
         for name in ("numpy", "scipy", "numba"):
             assert f"import {name}" not in text
             assert f"from {name}" not in text
+
+
+def test_the_control_process_does_without_the_connections_of_the_link() -> None:
+    """They are the link process's, and would take a tenth of its memory."""
+    program = (
+        "import sys, servotwin.edge_process.run\n"
+        "print({'ssl', 'http.client', 'sqlalchemy', 'numpy', 'servotwin.link.sqlite_outbox'} & set(sys.modules))"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert found.stdout == "set()\n"
