@@ -137,7 +137,7 @@ class BacklogPace:
         _forget(self._behind, now, _GONE_S)
         if not self.behind or now - self._changed < self._pause:  # the edges have not followed the last change yet
             return
-        # Where no edge is told a pause, a higher rate would never be tried: not a few edges', and later a fleet's.
+        # Where no edge is told a pause nobody tries a higher rate, and a whole fleet that comes back would meet it.
         faster = 1.0 if not _told(self._pause) else _MUCH_FASTER if seconds <= self._lag / 3.0 else _FASTER
         least = max(self._capacity * _LEAST_SHARE, _LEAST_PER_S, self.behind / LONGEST_OLDER_PAUSE_S)
         self._rate = max(self._rate * (faster if seconds <= self._lag else _SLOWER), least)
