@@ -11,7 +11,7 @@ from servotwin.hybrid.flow import listed_product, product
 from servotwin.hybrid.tables import (
     NODES_COARSE,
     NODES_FINE,
-    PART_TERMS,
+    PART_POWERS,
     PARTS,
     TERMS,
     VECTOR,
@@ -81,8 +81,8 @@ def _fill_single(t: Tables, mode: int) -> None:
 
 @subroutine
 def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
-    """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
-    n, stride, p = t.states, t.states * PART_TERMS, w.powers
+    """The powers ``(A s)**k`` of a part's flow, k = 1 .. PART_POWERS, transposed side by side."""
+    n, stride, p = t.states, t.states * PART_POWERS, w.powers
     base, source = flow * n * stride, mode * n * n
     moving = p.moving[: p.movers[0]]
     part = w.row[: moving.size]
@@ -91,14 +91,14 @@ def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float,
     for i in moving:
         for j in range(n):
             w.powers.term[j] = numbers.flows[source + i * n + j] * (step / PARTS)
-        for k in range(PART_TERMS):
+        for k in range(PART_POWERS):
             for j in range(n):
                 t.flow_part[base + j * stride + k * n + i] = w.powers.term[j]
             for j in range(moving.size):
                 part[j] = w.powers.term[moving[j]]
             listed_product(numbers.flows, source, n, n, moving, part, w.next_row)
             for j in range(n):
-                w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
+                w.powers.term[j] = w.next_row[j] * (step / PARTS)
 
 
 @subroutine

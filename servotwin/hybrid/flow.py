@@ -12,7 +12,7 @@ from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
 from servotwin.hybrid.tables import (
     NODES_COARSE,
-    PART_TERMS,
+    PART_POWERS,
     PARTS,
     TERMS,
     VECTOR,
@@ -40,7 +40,8 @@ class Scratch(NamedTuple):
     rows: Array
     series: Array
     change: Array
-    terms: Array
+    powers: Array
+    sums: Array
     starts: Array
     ends: Array
 
@@ -49,7 +50,7 @@ def new_scratch(tables: Tables, pending: Pending | None = None) -> Scratch:
     """Working memory for one run; `pending` where not all of the tables are filled."""
     n = tables.states
     rows = max(padded(2 * tables.guards * (NODES_COARSE + 1)), n + 4 * tables.guards)
-    sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
+    sizes = (rows, TERMS, n, n * PART_POWERS, n, DEPTH + 2, DEPTH + 2)
     return Scratch(pending or nothing_pending(tables), *(zeros(size) for size in sizes))
 
 
@@ -228,22 +229,43 @@ def advance(table: Array, base: int, x: Array, change: Array) -> None:
 
 @inlined
 def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
-    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
-    n = np.uint64(t.states)
-    n2, flow = t.states * t.states, t.flow_of[mode]
+    """Advance by ``fraction`` of a step: a tabled part, then a Taylor series of 12 terms.
+
+    The first four powers of the flow applied to the state, which need one product, are the terms of all orders but for
+    weights and the fourth power: two products more.
+    """
+    n, flow = np.uint64(t.states), t.flow_of[mode]
+    n_2, n_3 = n + n, n + n + n
     part = min(int(fraction * PARTS), PARTS - 1)
     rest = fraction * PARTS - part
+    change, powers, sums = scratch.change, scratch.powers, scratch.sums
     if part > 0:
-        advance(t.jump_part, (flow * PARTS + part) * n2, x, scratch.change)
-    terms = scratch.terms
-    tall_product(t.flow_part, flow * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
+        advance(t.jump_part, (flow * PARTS + part) * t.states * t.states, x, change)
+    base, stride = flow * t.states * t.states * PART_POWERS, t.states * PART_POWERS
+    if t.states == 16:
+        wide_product(t.flow_part, base, stride, stride, x, powers)
+    else:
+        tall_product(t.flow_part, base, stride, stride, x, powers)
+    w2 = rest * rest * (1 / 2)
+    w3 = w2 * rest * (1 / 3)
+    w4 = w3 * rest * (1 / 4)
+    w5 = w4 * rest * (1 / 5)
+    w6 = w5 * rest * (1 / 6)
+    w7 = w6 * rest * (1 / 7)
+    w8 = w7 * rest * (1 / 8)
+    w9 = w8 * rest * (1 / 9)
+    w10 = w9 * rest * (1 / 10)
+    w11 = w10 * rest * (1 / 11)
+    w12 = w11 * rest * (1 / 12)
     for i in range(n):
-        change = 0.0
-        at = np.uint64(PART_TERMS) * n + i
-        for _ in range(PART_TERMS):
-            at -= n
-            change = (change + terms[at]) * rest
-        x[i] += change
+        sums[i] = (w8 * x[i] + w9 * powers[i]) + (w10 * powers[n + i] + w11 * powers[n_2 + i]) + w12 * powers[n_3 + i]
+    fourth = base + 3 * t.states
+    product(t.flow_part, fourth, stride, t.states, sums, change)
+    for i in range(n):
+        sums[i] = change[i] + ((w4 * x[i] + w5 * powers[i]) + (w6 * powers[n + i] + w7 * powers[n_2 + i]))
+    product(t.flow_part, fourth, stride, t.states, sums, change)
+    for i in range(n):
+        x[i] += change[i] + (rest * powers[i] + (w2 * powers[n + i] + w3 * powers[n_2 + i]))
 
 
 @inlined

@@ -26,7 +26,7 @@ VECTOR = 16
 # |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 8)**13 / 13! = 2e-18. Fewer parts
 # with more terms, for an event costs less than one more power: most tables are those of runs with few events.
 TERMS = 24
-PART_TERMS = 12
+PART_POWERS = 4  # of 12 terms
 SPECTRAL_STEP = 2.0
 # A motion that lasts into the coarse search must turn slowly enough for a cubic over 8 steps: of 100 random pairs of
 # undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
@@ -51,7 +51,7 @@ class Tables(NamedTuple):
     jump_coarse: Array  # F * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # F * 8 * n * n, transposed
     jump_part: Array  # F * 8 * n * n, transposed: exp(A j step / 8) - I
-    flow_part: Array  # F * n * (12 * n): the Taylor series of exp(A s step / 8) x in s, without its first term
+    flow_part: Array  # F * n * (4 * n): powers 1 to 4 of A step / 8, transposed side by side
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside Bernstein rows over one step
     rows: Array  # M * G * n
     sizes: Array  # M * G * TERMS * n: sum over the orders of abs(taylor), those of each derivative's own series
@@ -181,7 +181,7 @@ def empty_tables(automaton: Automaton, flow_of: NDArray[np.int64] | None = None)
         "jump_coarse": flows * NODES_COARSE * n * n,
         "jump_fine": flows * NODES_FINE * n * n,
         "jump_part": flows * PARTS * n * n,
-        "flow_part": flows * PART_TERMS * n * n,
+        "flow_part": flows * PART_POWERS * n * n,
         "single": count * n * (n + 4 * guards),
         "rows": count * guards * n,
         "sizes": count * guards * TERMS * n,

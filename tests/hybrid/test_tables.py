@@ -8,10 +8,11 @@ from test_exponential import exact, off
 from servotwin.hybrid.automaton import Automaton
 from servotwin.hybrid.build import begin_tables, build_tables, fill_entered, fill_tables, new_workspace, numbers_of
 from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.flow import advance_fraction, new_scratch
 from servotwin.hybrid.tables import (
     NODES_COARSE,
     NODES_FINE,
-    PART_TERMS,
+    PART_POWERS,
     PARTS,
     TERMS,
     Tables,
@@ -82,15 +83,32 @@ def test_series_of_a_guard() -> None:
             assert np.allclose(sizes[m, g, 1], derivative.sum(axis=1), rtol=1e-13, atol=0.0)
 
 
-def test_terms_of_a_part() -> None:
+def test_powers_of_a_part() -> None:
     automaton, step = loop(Shape())
     tables, n = build_tables(automaton, step), len(automaton.names)
-    terms = tables.flow_part.reshape(-1, n, PART_TERMS, n)
+    powers = tables.flow_part.reshape(-1, n, PART_POWERS, n)
     for flow, which in zip(automaton.flows, tables.flow_of, strict=True):
-        expected = flow * (step / PARTS)
-        assert np.allclose(terms[which, :, 0].T, expected, rtol=1e-15, atol=0.0)
-        assert np.allclose(terms[which, :, 1].T, expected @ expected / 2.0, rtol=1e-13, atol=1e-25)
-        assert np.abs(terms[which].sum(axis=1).T - exact(flow, step / PARTS, 30)).max() < 1e-9
+        one = flow * (step / PARTS)
+        for k in range(PART_POWERS):
+            expected = np.linalg.matrix_power(one, k + 1)
+            size = np.linalg.matrix_power(np.abs(one), k + 1)
+            assert np.all(np.abs(powers[which, :, k].T - expected) <= 1e-14 * size)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_part_of_a_step_is_an_exponential(shape: Shape) -> None:
+    """To the rounding of what enters it, however much cancels."""
+    (automaton, step), rng = loop(shape), np.random.default_rng(3)
+    tables, n = build_tables(automaton, step), len(automaton.names)
+    scratch, worst = new_scratch(tables), 0.0
+    for mode, flow in enumerate(automaton.flows):
+        for fraction in (1e-9, 0.03, 0.1249, 0.125, 0.37, 0.9999, 1.0):
+            x = rng.normal(size=n)
+            moved = x.copy()
+            advance_fraction(tables, mode, moved, fraction, scratch)
+            jump = exact(flow, fraction * step)
+            worst = max(worst, float(np.max(np.abs(moved - x - jump @ x) / (np.abs(x) + np.abs(jump) @ np.abs(x)))))
+    assert worst < 2e-15
 
 
 @pytest.mark.parametrize("shape", SHAPES)
