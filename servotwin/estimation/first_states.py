@@ -41,7 +41,8 @@ def command_from_best_states(run: Run, unlimited: Run, units: Array, recorded: A
         return run(units * values)
 
     small, begin = _SMALL * rms(recorded), np.zeros(units.size)
-    given, columns = _responses(lambda values: unlimited(units * values), begin, small)
+    given = unlimited(begin)
+    columns = _columns(lambda values: unlimited(units * values), begin, given, small)
     # What fades in the dead zone would have to be vast to show behind it: it would then explain any command.
     farthest = _FARTHEST * max(float(np.max(np.abs(recorded))), float(np.max(np.abs(given))))
     # Where the law is at its limit all the time that it acts, no small change of its states shows.
@@ -53,16 +54,17 @@ def command_from_best_states(run: Run, unlimited: Run, units: Array, recorded: A
 
 def _descended(run: Run, states: Array, small: float, recorded: Array, farthest: float) -> Array:
     """Command (n,) of a law from the states that fit the recorded one best beside given ones."""
-    given, columns = _responses(run, states, small)
+    given = run(states)
+    columns = _columns(run, states, given, small)
     for _ in range(_ROUNDS):
         after = _within(columns, recorded - given, states, farthest)
         foretold = given + columns @ (after - states)
-        made, responses = _responses(run, after, small)
+        made = run(after)
         if rms(recorded - made) >= rms(recorded - given):
-            break
-        states, given, columns = after, made, responses
-        if rms(given - foretold) <= _LINEAR * rms(recorded):
-            break
+            return given
+        if rms(made - foretold) <= _LINEAR * rms(recorded):
+            return made
+        states, given, columns = after, made, _columns(run, after, made, small)
     return given
 
 
@@ -79,11 +81,9 @@ def _within(columns: Array, target: Array, states: Array, farthest: float) -> Ar
     return np.asarray(states + lsq_linear(triangle, orthogonal.T @ target, bounds, method="bvls").x)
 
 
-def _responses(run: Run, states: Array, small: float) -> tuple[Array, Array]:
-    """Command (n,) from states, and what each adds to it per unit (n, k)."""
-    given = run(states)
-    changes = small * np.eye(states.size)
-    return given, np.stack([(run(states + each) - given) / small for each in changes], axis=1)
+def _columns(run: Run, states: Array, given: Array, small: float) -> Array:
+    """What each state adds per unit (n, k) to the command `given` from some states."""
+    return np.stack([(run(states + each) - given) / small for each in small * np.eye(states.size)], axis=1)
 
 
 def least_squares(columns: Array, target: Array) -> Array:
