@@ -65,10 +65,24 @@ def test_a_bias_estimated_at_rest_is_fed_forward(policy: CertifiedPolicy) -> Non
     assert made.setting.band == band_of(made.certificate)
 
 
-def test_a_bias_beyond_the_limit_is_fed_forward_up_to_it(policy: CertifiedPolicy) -> None:
+def test_a_bias_beyond_what_is_stated_is_not_fed_forward_with_the_fallback_set(policy: CertifiedPolicy) -> None:
+    """The voltage may be misread: the fallback set is verified as it is for every stated bias."""
     made = policy.redesign(Evidence(estimated(10.0), at_rest(-5.0), rests=(-5.0, -5.0)))
     assert made.setting is not None
-    assert made.setting.gains.feedforward == policy.feedforward_limit
+    assert made.certificate == policy.fallback()
+    assert made.setting.gains.feedforward == 0.0
+    assert "the windows show an input bias of" in made.reason
+
+
+def test_the_fallback_set_says_for_which_biases_its_feedforward_is(policy: CertifiedPolicy) -> None:
+    bare = policy.fallback()
+    made = policy.fall_back(Evidence(estimated(10.0), at_rest(0.04, 1e-4), rests=(0.04, 0.04)), "asked for")
+    assert made.certificate is not None
+    assert made.certificate.setting.controller.feedforward == -0.04
+    assert made.certificate.input_bias == (bare.input_bias[0] + 0.04, bare.input_bias[1] + 0.04)
+    assert made.certificate.effort == bare.effort + 0.04
+    vague = policy.fall_back(Evidence(estimated(10.0), at_rest(0.04, 0.1), rests=(0.04, 0.04)), "asked for")
+    assert vague.certificate == bare
 
 
 def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: CertifiedPolicy) -> None:

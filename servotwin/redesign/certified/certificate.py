@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import in_words
-from servotwin.redesign.design import Design
+from servotwin.redesign.design import Design, with_feedforward
 
 
 @dataclass(frozen=True)
@@ -205,6 +205,16 @@ class Certificate:
         low, high = (math.degrees(end) for end in self.gap)
         share = f"{100.0 * self.settled:.4g} % of {self.members} simulated machines settled"
         return f"<Certificate of {self.setting!r}: {share}, gaps {low:.4g} .. {high:.4g} deg, Ms {self.Ms:.3g}>"
+
+    def fed(self, feedforward: float) -> Certificate:
+        """The setting, verified without a feedforward, with one (V), and the input biases that leave what was verified.
+
+        As long as no voltage meets its limit, the feedforward matters only through the bias that it leaves.
+        """
+        low, high = self.input_bias
+        # What is fed forward is held at rest too.
+        effort, setting = self.effort + abs(feedforward), with_feedforward(self.setting, feedforward)
+        return replace(self, setting=setting, input_bias=(low - feedforward, high - feedforward), effort=effort)
 
     def tried(self, servo: Plant) -> str:
         """Sentence on what was tried, with ranges in the units of the servo or axis that was verified."""

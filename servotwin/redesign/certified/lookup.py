@@ -155,7 +155,7 @@ class CertifiedTable:
         if verified:
             widest = verified[0][0].level + _PREFERRED_LEVELS
             same = [one for key, one in verified if key.level <= widest and alike(one.setting, running)]
-            return _with_feedforward((same or [verified[0][1]])[0], region.feedforward)
+            return (same or [verified[0][1]])[0].fed(region.feedforward)
         low, high = (math.degrees(end) for end in region.gap)
         bias = 1e3 * region.largest_bias
         return NotVerified(
@@ -332,12 +332,3 @@ def _is_stated(servo: Plant, machine: FactorPrior, known: Uncertainty) -> bool:
 
 def _contains(cell: Range, low: float, high: float) -> bool:
     return cell[0] <= low and high <= cell[1]
-
-
-def _with_feedforward(certificate: Certificate, feedforward: float) -> Certificate:
-    """Certificate with a feedforward, and with the range of input biases that the cell then covers."""
-    low, high = certificate.input_bias
-    law = certificate.setting.controller.replace(feedforward=feedforward)
-    setting, biases = replace(certificate.setting, controller=law), (low - feedforward, high - feedforward)
-    # What is fed forward is held at rest too.
-    return replace(certificate, setting=setting, input_bias=biases, effort=certificate.effort + abs(feedforward))

@@ -152,8 +152,8 @@ class CertifiedPolicy:
 
     def _without(self, evidence: Evidence, region: Region, fallback: Certificate, reason: str) -> Redesign:
         """The fallback set, where a search found nothing and it is not in force yet."""
-        fed = with_feedforward(fallback.setting, region.feedforward)
-        if _in_force(fed, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
+        untold = not math.isfinite(evidence.disturbance.bias_std) and alike(fallback.setting, evidence.setting)
+        if untold or _in_force(_fed(fallback, region).setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
             return Redesign(None, math.nan, f"{reason}; the fallback set stays")
         return _fallback_redesign(fallback, region, reason)
 
@@ -352,9 +352,18 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
 
 
 def _fallback_redesign(certificate: Certificate, region: Region, reason: str) -> Redesign:
-    law = certificate.setting.controller.replace(feedforward=region.feedforward)
-    certificate = replace(certificate, setting=replace(certificate.setting, controller=law))
-    return _redesign(certificate, region.noise, math.nan, f"{reason}; the fallback set is sent")
+    return _redesign(_fed(certificate, region), region.noise, math.nan, f"{reason}; the fallback set is sent")
+
+
+def _fed(fallback: Certificate, region: Region) -> Certificate:
+    """The fallback set with the feedforward against a known input bias: it is verified for what that leaves.
+
+    As it is where the evidence contradicts the stated biases: it is for every machine within these, and one whose
+    voltage is misread is one of them.
+    """
+    (low, high), fed = region.input_bias, fallback.fed(region.feedforward)
+    known = all(least <= low and high <= most for least, most in (fallback.input_bias, fed.input_bias))
+    return fed if known else fallback
 
 
 def _redesign(certificate: Certificate, noise: float, gap: float, reason: str) -> Redesign:
