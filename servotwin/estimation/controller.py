@@ -40,6 +40,7 @@ _FEWEST_BLOCKS = 100  # of two samples
 _TOLERATED = 0.1  # share of the voltage's swing: a discretisation or a rate that differs leaves less
 _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, as volts, that are tolerated
 _NOISES = 2.0  # the same of noise as a linear law shows it in the means, from what it read and from what was recorded
+_HARDLY = 0.03  # share of the stated controller's swing: less is no voltage that turns the motor
 _LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
 _FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
 _VAST = 1e-20 * math.sqrt(sys.float_info.max)  # V: sums of squares of such integrals are beyond the range of floats
@@ -60,12 +61,15 @@ class ControllerComparison:
         Largest `unexplained` (V) that noise, rounding and discretisation account for.
     factors : dict of str to float
         Gains that explain the voltage, in stated ones; empty where the stated controller does, or where no gains do.
+    expected : float
+        Root mean square of the stated controller's voltage about its mean, V.
     """
 
     unexplained: float
     swing: float
     tolerated: float
     factors: dict[str, float]
+    expected: float
 
     @property
     def agrees(self) -> bool:
@@ -73,10 +77,21 @@ class ControllerComparison:
         return self.unexplained <= self.tolerated
 
     @property
+    def misread(self) -> bool:
+        """True where the voltage hardly moves, or moves the other way: then it is not the one that turned the motor."""
+        still, reversed_ = self.swing < _HARDLY * self.expected, self.factors.get("Kp", 0.0) < 0.0
+        return not self.agrees and (still or reversed_)
+
+    @property
     def sentence(self) -> str:
         """Sentence for the operator; empty where the controllers agree."""
         if self.agrees:
             return ""
+        if self.swing < _HARDLY * self.expected:
+            return (
+                f"the voltage moves by {self.swing:.2g} V rms where the stated controller would move it by "
+                f"{self.expected:.2g} V: is its channel dead, or in another unit?"
+            )
         share = f"{100.0 * self.unexplained / self.swing:.0f} % of the voltage's swing"
         fitting = ", ".join(f"{name} {factor:.2g}" for name, factor in self.factors.items())
         like = f"; it fits {fitting} times the stated" if fitting else ", and so do other gains"
@@ -104,8 +119,8 @@ def compare_controller(window: Window, controller: AnyController, tolerance: flo
     Returns
     -------
     ControllerComparison or None
-        None: voltage or reference were not recorded, the voltage moves too little beside noise and rounding, or the
-        squares of such numbers are beyond the range of floats.
+        None: voltage or reference were not recorded, neither the voltage nor that of the controller moves much beside
+        noise and rounding, or the squares of such numbers are beyond the range of floats.
     """
     if window.voltage is None or window.reference is None:
         return None
@@ -136,18 +151,19 @@ def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float)
     spreads = np.array([0.0, *(_noise(each) + _rounding(each) for each in inputs.T[1:])])
     for delay in range(_DELAYS):
         voltage, rest = window.voltage[delay:], inputs[: len(inputs) - delay]
-        means = _means(voltage, 0)
-        swing = rms(means - means.mean())
+        swing = _swing(_means(voltage, 0))
         noise = rms(_means(noise_in_command(running, tolerance, rest, spreads), 0))
         tolerated = _TOLERATED * swing + _ROUNDING * _rounding(voltage) + _NOISES * noise
-        if tolerated >= _LARGEST * swing:
+        given = command_from_best_start(running, tolerance, voltage, rest)
+        expected = _swing(_means(given, 0))
+        if tolerated >= _LARGEST * max(swing, expected):
             return None
-        unexplained = rms(_means(voltage - command_from_best_start(running, tolerance, voltage, rest), 0))
+        unexplained = rms(_means(voltage - given, 0))
         factors: dict[str, float] = {}
         if unexplained > tolerated and (made is None or not made.factors):
             fitting, left = other_gains(law, tolerance, voltage, rest, window.sample_rate)
             factors = fitting if rms(_means(left, 0)) <= tolerated else {}
-        later = ControllerComparison(unexplained, swing, tolerated, factors)
+        later = ControllerComparison(unexplained, swing, tolerated, factors, expected)
         if later.agrees:
             return later
         made = later if made is None or (later.factors and not made.factors) else made
@@ -172,16 +188,18 @@ def _compared(
     first = _forgotten(parameters)
     if position.size - first < 2 * _FEWEST_BLOCKS:
         return None
-    means, stiff = _means(voltage, first), _stiffness(parameters)
-    swing, rounding = rms(means - means.mean()), _rounding(voltage) + stiff * _rounding(position)
+    swing, stiff = _swing(_means(voltage, first)), _stiffness(parameters)
+    rounding = _rounding(voltage) + stiff * _rounding(position)
     tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
-    if tolerated >= _LARGEST * swing:
+    given = _voltage_from_best_start(parameters, voltage, reference, position)
+    expected = _swing(_means(given, first))
+    if tolerated >= _LARGEST * max(swing, expected):
         return None
-    unexplained = rms(_means(voltage - _voltage_from_best_start(parameters, voltage, reference, position), first))
+    unexplained = rms(_means(voltage - given, first))
     factors: dict[str, float] = {}
     if asked and not unexplained <= tolerated:
         factors = _factors(parameters, fading, voltage, reference, position, first, tolerated)
-    return ControllerComparison(unexplained, swing, tolerated, factors)
+    return ControllerComparison(unexplained, swing, tolerated, factors, expected)
 
 
 def _voltage_from_best_start(parameters: LawParameters, voltage: Array, reference: Array, position: Array) -> Array:
@@ -337,6 +355,11 @@ def _means(values: Array, first: int) -> Array:
     length = max(2, (values.size - first) // _BLOCKS)
     count = min(_BLOCKS, (values.size - first) // length)
     return values[first : first + count * length].reshape(count, length).mean(axis=1)
+
+
+def _swing(means: Array) -> float:
+    """Root mean square about the mean."""
+    return rms(means - means.mean())
 
 
 def _rounding(values: Array) -> float:

@@ -40,8 +40,11 @@ def command_from_best_states(run: Run, unlimited: Run, units: Array, recorded: A
     def scaled(values: Array) -> Array:
         return run(units * values)
 
-    small, begin = _SMALL * rms(recorded), np.zeros(units.size)
+    begin = np.zeros(units.size)
     given = unlimited(begin)
+    small = _SMALL * (rms(recorded) or rms(given))
+    if small == 0.0:
+        return run(begin)
     columns = _columns(lambda values: unlimited(units * values), begin, given, small)
     # What fades in the dead zone would have to be vast to show behind it: it would then explain any command.
     farthest = _FARTHEST * max(float(np.max(np.abs(recorded))), float(np.max(np.abs(given))))

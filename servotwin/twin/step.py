@@ -67,7 +67,7 @@ from servotwin.twin.state import TwinState, draft_update
 from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
-_OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
+_OTHER = "the voltage is not that of the stated controller: a setting follows when that of a window is"
 _OVERTAKEN = "a newer window of this servo has come: the setting follows from that"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
@@ -226,7 +226,7 @@ def _work_on(
         state, redesign = _redesign(model, state, evidence, learnt.stale)
         if again is not None and state.oversight.again is None:
             records.append(ActRecord(again, redesign.reason if redesign.setting is None else "", later=True))
-    if learnt.disturbance.known and not learnt.stale:
+    if learnt.disturbance.known and not learnt.stale and state.other_controller < OTHER_CONTROLLER:
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     if not learnt.stale and not state.oversight.held:
@@ -319,6 +319,7 @@ def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tupl
     if made is None:
         return state, []
     before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
+    count = max(count, OTHER_CONTROLLER) if made.misread else count  # one such window is enough
     return replace(state, other_controller=count), [made.sentence] if count == OTHER_CONTROLLER > before else []
 
 

@@ -197,6 +197,32 @@ def test_a_window_of_few_samples_tells_another_controller_too():
     assert "not that of the stated controller" in made.sentence
 
 
+@pytest.mark.parametrize(
+    ("misread", "said"),
+    [
+        (lambda voltage: 0.0 * voltage, "the voltage moves by 0 V rms where the stated controller would move it by"),
+        (lambda voltage: 0.0 * voltage + 2.0, "the voltage moves by 0 V rms where"),
+        (lambda voltage: 1e-3 * voltage, "is its channel dead, or in another unit?"),
+        (lambda voltage: -voltage, "it fits Kp -1, Kd -1 times the stated"),
+    ],
+    ids=["dead", "stuck", "millivolts", "reversed"],
+)
+def test_a_voltage_that_is_not_the_motors_is_said_so(misread, said):
+    window = loop(LAW.replace(Ki=0.0), input_bias=0.05)
+    made = compare_controller(window, LAW.replace(Ki=0.0), ZONE)
+    assert made.agrees
+    assert not made.misread
+    wrong = compare_controller(window.replace(voltage=misread(window.voltage)), LAW.replace(Ki=0.0), ZONE)
+    assert wrong.misread
+    assert said in wrong.sentence
+
+
+def test_other_gains_are_no_misread_voltage():
+    made = compare_controller(by_hand(LAW.replace(Kp=0.3 * LAW.Kp, Kd=0.3 * LAW.Kd, Ki=0.0), 0.0), LAW, 0.0)
+    assert not made.agrees
+    assert not made.misread
+
+
 def test_a_window_that_shows_nothing_gives_no_verdict():
     window = by_hand(LAW, 0.0)
     noise = np.random.default_rng(3).normal(0.0, 1e-3, window.position.size)

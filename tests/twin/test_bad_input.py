@@ -177,7 +177,17 @@ def test_another_controller_is_said_and_no_setting_follows_until_the_stated_one_
     ]  # fmt: skip
     assert "it fits Kp 0.5, Ki 0.3, Kd 1 times the stated" in seen.alarms[2]
     assert [redesign.setting is not None for redesign in seen.redesigns] == [True, True, False, False, True, True]
-    assert "another controller" in seen.redesigns[2].reason
+    assert "the voltage is not that of the stated controller" in seen.redesigns[2].reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.0, 1e-3, -1.0], ids=["dead", "millivolts", "reversed"])
+def test_a_voltage_that_is_not_the_motors_is_said_at_once_and_gets_no_setting(factor):
+    stated = TwinModel.of(MODEL, TwinSettings(policy="margin"), start=Setting(MODEL.tolerance_for(math.radians(10.0))))
+    own = list(windows_of(MODEL, 10.0, 4))
+    seen = Seen([own[0], *(each.replace(voltage=factor * each.voltage) for each in own[1:3]), own[3]], stated)
+    assert "stated controller" in seen.alarms[1]
+    assert [redesign.setting is not None for redesign in seen.redesigns] == [True, False, False, True]
 
 
 @pytest.mark.slow

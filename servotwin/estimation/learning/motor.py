@@ -274,6 +274,8 @@ def _posterior(rows: MotorRows, mean: Array, covariance: Array) -> tuple[Array, 
     ones = np.array([1.0, 1.0, 0.0, 0.0])
     remainder = rows.voltage - rows.design @ (ones + mean)
     size = float(np.sqrt(np.mean(rows.voltage**2)))
+    if size == 0.0:
+        return None
     # In units of the prior's spreads, which differ by orders of magnitude.
     spread = np.sqrt(np.diag(covariance))
     precision = np.linalg.inv(covariance / np.outer(spread, spread))
