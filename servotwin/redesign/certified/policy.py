@@ -153,7 +153,8 @@ class CertifiedPolicy:
     def _without(self, evidence: Evidence, region: Region, fallback: Certificate, reason: str) -> Redesign:
         """The fallback set, where a search found nothing and it is not in force yet."""
         untold = not math.isfinite(evidence.disturbance.bias_std) and alike(fallback.setting, evidence.setting)
-        if untold or _in_force(_fed(fallback, region).setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
+        small = SAME_FEEDFORWARD * self.ranges.smallest_answer
+        if untold or _in_force(_fed(fallback, region).setting, evidence, small):
             return Redesign(None, math.nan, f"{reason}; the fallback set stays")
         return _fallback_redesign(fallback, region, reason)
 
