@@ -15,8 +15,9 @@ def main() -> None:
     if interruptible:
         signal.signal(signal.SIGINT, _leave)
     from servotwin.cli.app import command_line
+    from servotwin.cli.output import checked_output
 
-    run = command_line()
+    run, output = command_line(), checked_output()
     if interruptible:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -26,6 +27,8 @@ def main() -> None:
             # Python remembers an interrupt inside of `exec` (as in a compilation) and would end by the signal; another
             # `exec` makes it forget.
             exec("")
+        if output is not None:
+            end.code = output.exit_code(end.code)
         raise
 
 
