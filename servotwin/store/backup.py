@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
-from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
+from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION
@@ -24,6 +24,8 @@ PAGES = 2048
 PRIVATE = 0o600
 _SERIAL_MARGIN = 1_000_000
 """Upper bound of the messages to one edge that may have been posted since a backup."""
+_OF_READING = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_IOERR_READ, sqlite3.SQLITE_IOERR_SHORT_READ)
+"""Errors of a copy that are of its source, as damage is: only there may another process be at work."""
 
 Progress = Callable[[int, int], None]
 """(pages that remain, pages in all)."""
@@ -71,7 +73,7 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
     if to.exists() and not replace:
         raise InvalidInput(f"backup {to}: exists already; give another file, or --replace to replace it")
     with atomic_output(to, PRIVATE) as temporary:
-        return _copied(source, temporary, progress)
+        return _copied(source, temporary, to, progress)
 
 
 def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowCounts:
@@ -91,8 +93,8 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)
     with atomic_output(place, PRIVATE) as temporary:
-        counts = _copied(backed_up, temporary, progress)
-        with _opened(temporary, "mode=rw") as store:
+        counts = _copied(backed_up, temporary, place, progress)
+        with _opened(temporary, "mode=rw", place) as store:
             # Serials that edges received after the backup must not be used again.
             # Not by a margin alone: a second restore of one backup would use those of the first.
             serials = (_SERIAL_MARGIN + 1, fresh_serial(time.time()))
@@ -120,16 +122,16 @@ def _source_file(url: str, command: str, file: Path) -> Path:
     raise InvalidInput(f"store {public_address(address)}: is in memory; give that of a file")
 
 
-def _copied(source: Path, target: Path, progress: Progress | None) -> RowCounts:
-    """Copy the source as of one moment into the target, compare and check it."""
-    with _opened(source, "mode=ro") as original, _opened(target, "mode=rw") as copy:
-        # The first read fixes the snapshot: later writes go to the log.
-        original.execute("BEGIN")
-        _check_revision(original, source)
-        expected = _counts(original)
-        report = None if progress is None else lambda _, left, total: progress(left, total)
-        original.backup(copy, pages=PAGES, progress=report)
-        original.execute("ROLLBACK")
+def _copied(source: Path, target: Path, to: Path, progress: Progress | None) -> RowCounts:
+    """Copy the source as of one moment into the target, which will be named `to`; compare and check it."""
+    with _opened(target, "mode=rw", to) as copy:
+        with _opened(source, "mode=ro") as original:
+            # The first read fixes the snapshot: later writes go to the log.
+            original.execute("BEGIN")
+            _check_revision(original, source)
+            expected = _counts(original)
+            _copy_pages(original, copy, to, progress)
+            original.execute("ROLLBACK")
         # Without a write-ahead log the copy is a single file.
         copy.execute("PRAGMA journal_mode = DELETE")
         faults = [row[0] for row in copy.execute("PRAGMA integrity_check(1)")]
@@ -141,15 +143,33 @@ def _copied(source: Path, target: Path, progress: Progress | None) -> RowCounts:
         return expected
 
 
+def _copy_pages(original: sqlite3.Connection, copy: sqlite3.Connection, to: Path, progress: Progress | None) -> None:
+    """Copy all pages; SQLite does not tell which of the two files an error is of."""
+    report = None if progress is None else lambda _, left, total: progress(left, total)
+    try:
+        original.backup(copy, pages=PAGES, progress=report)
+    except sqlite3.Error as error:
+        if is_damage(error) or error.sqlite_errorcode in _OF_READING:
+            raise
+        raise _not_written(to, error) from None
+
+
 @contextmanager
-def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
-    """Open a connection; an error of SQLite becomes InvalidInput."""
+def _opened(path: Path, mode: str, to: Path | None = None) -> Iterator[sqlite3.Connection]:
+    """Open a connection; an error of SQLite becomes InvalidInput, of a file that will be named `to` with that name."""
     try:
         uri = f"{path.absolute().as_uri()}?{mode}"
         with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
             yield connection
     except sqlite3.Error as error:
-        raise InvalidInput(f"store {path}: cannot be read or written ({error})") from None
+        if to is not None:
+            raise _not_written(to, error) from None
+        fault = "is damaged" if is_damage(error) else "cannot be read or written"
+        raise InvalidInput(f"store {path}: {fault} ({error})") from None
+
+
+def _not_written(to: Path, error: sqlite3.Error) -> InvalidInput:
+    return InvalidInput(f"output {to}: cannot be written ({error})")
 
 
 def _check_revision(connection: sqlite3.Connection, path: Path) -> None:

@@ -1,10 +1,14 @@
 """Backup, restore and retention: stored data stays whole, and nothing is overwritten."""
 
 import os
+import resource
 import shutil
 import sqlite3
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -104,6 +108,40 @@ def test_a_store_that_cannot_be_backed_up_is_refused(url: str, tmp_path: Path) -
         backup(url, tmp_path / "nowhere" / "backup.db")
     assert not to.exists()
     store.close()
+
+
+def test_a_backup_and_a_restore_name_the_file_that_is_damaged_or_cannot_be_written(url: str, tmp_path: Path) -> None:
+    filled(url, 400).close()
+    to, file, kept = tmp_path / "copy.db", tmp_path / "store.db", tmp_path / "kept.db"
+    backup(url, kept)
+    for copy in (partial(backup, url, to), partial(restore, kept, str(to))):
+        with files_of_at_most(300_000), pytest.raises(InvalidInput, match=rf"^output {to}: cannot be written \("):
+            copy()
+    damage_pages(file)
+    shutil.copyfile(file, kept)
+    for copy, damaged in ((partial(backup, url, to), file), (partial(restore, kept, str(to)), kept)):
+        with pytest.raises(InvalidInput, match=rf"^store {damaged}: is damaged \("):
+            copy()
+    assert sorted(path.name for path in tmp_path.iterdir() if "copy" in path.name) == []
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """As on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def damage_pages(file: Path) -> None:
+    """Overwrite all pages but those of the schema."""
+    size = file.stat().st_size
+    with file.open("r+b") as opened:
+        opened.seek(size // 8)
+        opened.write(os.urandom(size - size // 8))
 
 
 def test_a_second_restore_of_a_backup_continues_above_the_serials_of_the_first(
