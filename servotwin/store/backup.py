@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
@@ -66,6 +67,7 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
         There is no store, it is in PostgreSQL, or the file exists or cannot be written.
     """
     source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
+    check_named(source, "store ")
     if not source.is_file():
         raise InvalidInput(f"store {source}: there is no such file; give that of a store")
     if to.exists() and to.samefile(source):
@@ -89,6 +91,8 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         The backup is damaged or of a newer servotwin; the store holds data, is in use, or is in PostgreSQL.
     """
     place = _source_file(url, "pg_restore --dbname=DATABASE {}", backed_up)
+    check_named(place, "store ")
+    check_named(backed_up, "backup ")
     if not backed_up.is_file():
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -9,6 +10,8 @@ import sqlalchemy as sa
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import POSTGRESQL, public_address, transaction
 from servotwin.store.schema import REVISION, metadata
+
+log = logging.getLogger(__name__)
 
 VERSIONS = "servotwin_version"
 """Name of the table that holds the revision."""
@@ -38,6 +41,8 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
         if current != to:
             _check(connection, current, to)
             _upgrade(connection, to, scripts)
+    if current is None:
+        log.info("new store", extra={"store": public_address(engine.url)})
 
 
 def is_newest(engine: sa.Engine) -> bool:

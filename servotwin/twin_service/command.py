@@ -11,6 +11,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from servotwin.config.named_file import check_named
 from servotwin.config.table import named, of_key
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import check_broker
@@ -113,10 +114,14 @@ def open_existing_store(config: ServiceConfig) -> Store:
         There is none, or it cannot be opened.
     """
     file = sqlite_file(parse_address(config.store))
+    if file is not None:
+        check_named(file, "store ")
     if file is not None and not file.is_file():
         raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
     if file is not None and not file.stat().st_size and not file.with_name(f"{file.name}-wal").exists():
-        raise InvalidInput(f"store {file}: is empty: cut short, or never written; restore a backup, or move it away")
+        raise InvalidInput(
+            f"store {file}: is empty: cut short, or never written; restore a backup, or let the twin begin anew"
+        )
     return _open_configured_store(config)
 
 
@@ -129,11 +134,12 @@ def _exclusive_store(store: str) -> Iterator[None]:
     Raises
     ------
     InvalidInput
-        Another process has the lock, or the lock file cannot be made.
+        It is no file, another process has the lock, or the lock file cannot be made.
     """
     file = sqlite_file(parse_address(store))
     with ExitStack() as stack:
         if file is not None:
+            check_named(file, "store ")
             try:
                 stack.enter_context(locked(lock_beside(file)))
             except BlockingIOError:

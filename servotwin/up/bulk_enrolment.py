@@ -42,7 +42,7 @@ def _number(column: str, unit: str, above: bool) -> Callable[[str], float]:
             value = -1.0
         if not (value > 0.0 if above else value >= 0.0) or value == float("inf"):
             allowed = "above 0" if above else "of 0 or more"
-            raise InvalidInput(f"{column} = {text!r}: give a number {allowed}, in {unit}")
+            raise InvalidInput(f"{column} = {text[:80]!r}: give a number {allowed}, in {unit}")
         return value
 
     return parse
@@ -155,7 +155,9 @@ def _check_head(path: Path, head: list[str], columns: list[str]) -> None:
         if any(separator in name for separator in (";", "\t")):
             raise InvalidInput(f"{path}: line 1: separates its columns by semicolons or tabs; separate them by commas")
         if name not in columns:
-            raise InvalidInput(f"{path}: line 1: column {name!r} is not known{did_you_mean(name, columns)}; {allowed}")
+            raise InvalidInput(
+                f"{path}: line 1: column {name[:80]!r} is not known{did_you_mean(name, columns)}; {allowed}"
+            )
     if len(set(head)) < len(head) or "name" not in head:
         raise InvalidInput(f"{path}: line 1: column 'name' is missing, or a column is named twice; {allowed}")
 
@@ -180,7 +182,7 @@ def _repeated(requests: Mapping[int, Enrolment]) -> Iterator[tuple[int, str]]:
     names, folders = dict[str, int](), dict[Path, int]()
     for line, request in requests.items():
         if (first := names.setdefault(request.servo, line)) != line:
-            yield line, f"name {request.servo!r}: line {first} has it already"
+            yield line, f"name {request.servo[:80]!r}: line {first} has it already"
         elif (first := folders.setdefault(request.folder.resolve(), line)) != line:
             yield line, f"edge {request.folder}: line {first} has that folder already"
 

@@ -311,7 +311,7 @@ def _tokens_file(twin: TwinFile) -> Path:
 
 def _check(request: Enrolment, known: Verifiers) -> None:
     if request.role not in ROLES:
-        raise InvalidInput(f"role = {request.role!r} is not allowed; give one of {', '.join(ROLES)}")
+        raise InvalidInput(f"role = {request.role[:80]!r} is not allowed; give one of {', '.join(ROLES)}")
     _check_name(request.servo, known.servos, request.replace_token)
     _check_folder(request)
 
@@ -335,6 +335,6 @@ def _check_folder(request: Enrolment) -> None:
 
 def _check_name(name: str, known: Mapping[str, bytes], replace_token: bool) -> None:
     if not re.match(NAME_PATTERN, name):
-        raise InvalidInput(f"name {name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        raise InvalidInput(f"name {name[:80]!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     if name in known and not replace_token:
         raise InvalidInput(f"{name!r} has a token already; give --again to replace it by a new one")

@@ -62,5 +62,31 @@ def test_a_store_that_was_cut_to_nothing_is_not_checked_as_a_new_one(tmp_path: P
     file.touch()
     result = CliRunner().invoke(app, ["twin", "check", "--config", str(config)])
     assert result.exit_code == INVALID
-    assert "twin.db: is empty: cut short, or never written" in result.stderr
+    assert "twin.db: is empty: cut short, or never written; restore a backup, or let the twin begin" in result.stderr
     assert file.stat().st_size == 0
+
+
+@pytest.mark.parametrize("command", [["twin", "check"], ["servos"], ["twin"], ["backup", "b.db"], ["restore", "b.db"]])
+def test_a_folder_in_the_place_of_the_store_is_called_one(tmp_path: Path, command: list[str]) -> None:
+    config = twin_file(tmp_path)
+    (tmp_path / "twin.db").mkdir()
+    before = sorted(tmp_path.iterdir())
+    result = CliRunner().invoke(app, [*command, "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert result.stderr == f"error: store {tmp_path / 'twin.db'}: is a folder; give the name of a file\n"
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_backup_that_is_a_device_is_called_one(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["restore", "/dev/zero", "--config", str(twin_file(tmp_path))])
+    assert result.exit_code == INVALID
+    assert result.stderr == "error: backup /dev/zero: is a device; give the name of a file\n"
+
+
+def test_a_store_that_begins_on_an_empty_file_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    file = tmp_path / "twin.db"
+    file.touch()
+    for _ in range(2):
+        open_store(str(file)).close()
+    assert caplog.messages.count("new store") == 1

@@ -92,6 +92,19 @@ def test_bad_rows_are_each_named_with_their_line_and_nothing_is_written(folder: 
     assert (files(folder), (folder / "tokens.toml").read_bytes()) == (before, tokens)
 
 
+def test_a_cell_of_any_length_is_quoted_in_part(folder: Path) -> None:
+    long = "x" * 5000
+    for rows in (
+        f"name\n{long}\n{long}\n",
+        f"name,{long}\nax-3,\n",
+        f"name,role,noise_um\nax-3,{long},\nax-4,,{long}\n",
+    ):
+        code, said, error = enroll(folder, rows, "--url", URL)
+        assert (code, said) == (2, "")
+        assert "x" * 80 in error
+        assert "x" * 81 not in error
+
+
 def test_a_folder_that_cannot_be_written_leaves_all_as_it_was(folder: Path) -> None:
     assert enroll(folder, "name\nax-1\n", "--url", URL)[0] == 0
     (folder / "file").write_text("")
