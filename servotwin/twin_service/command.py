@@ -118,11 +118,18 @@ def open_existing_store(config: ServiceConfig) -> Store:
         check_named(file, "store ")
     if file is not None and not file.is_file():
         raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
-    if file is not None and not file.stat().st_size and not file.with_name(f"{file.name}-wal").exists():
+    if file is not None and not any(_size(file.with_name(file.name + end)) for end in ("", "-wal")):
         raise InvalidInput(
             f"store {file}: is empty: cut short, or never written; restore a backup, or let the twin begin anew"
         )
     return _open_configured_store(config)
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0
 
 
 @contextmanager

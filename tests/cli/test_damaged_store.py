@@ -57,9 +57,11 @@ def test_a_store_that_another_program_keeps_locked_is_said_in_words(
         other.put([window("ax-1", 1)])
 
 
-def test_a_store_that_was_cut_to_nothing_is_not_checked_as_a_new_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("beside", [[], ["twin.db-wal", "twin.db-shm"]], ids=["alone", "with an empty log"])
+def test_a_store_that_was_cut_to_nothing_is_not_checked_as_a_new_one(tmp_path: Path, beside: list[str]) -> None:
     config, file = twin_file(tmp_path), tmp_path / "twin.db"
-    file.touch()
+    for name in [file.name, *beside]:
+        (tmp_path / name).touch()
     result = CliRunner().invoke(app, ["twin", "check", "--config", str(config)])
     assert result.exit_code == INVALID
     assert "twin.db: is empty: cut short, or never written; restore a backup, or let the twin begin" in result.stderr
