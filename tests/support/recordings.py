@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import lfilter
 
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.plant.backlash import play
@@ -50,3 +51,18 @@ def csv(path, values, header="time_s,motor_rad,load_rad", separator=",", comma=F
     text = "\n".join(lines) + "\n"
     path.write_text(text.replace(".", ",") if comma else text)
     return path
+
+
+def to_and_fro(speeds=(3.0,), rest=0.0, gap=0.0, lag=0.0, delay=0.0, count=1e-4, rate=200.0, seconds=40.0):
+    """A motor to and fro over 6 rad, at each of the speeds in turn, with rests; its load is late in one of two ways."""
+    corners, time = [(0.0, -3.0)], np.arange(0.0, seconds, 1.0 / rate)
+    while corners[-1][0] < seconds:
+        speed = speeds[(len(corners) - 1) // (4 if rest else 2) % len(speeds)]
+        corners.append((corners[-1][0] + 6.0 / speed, -corners[-1][1]))
+        corners += [(corners[-1][0] + rest, corners[-1][1])] if rest else []
+    motor = np.interp(time, *np.transpose(corners))
+    load = play(np.interp(time - delay, time, motor), gap)
+    if lag:
+        share = 1.0 - np.exp(-1.0 / (rate * lag))
+        load, _ = lfilter([share], [1.0, share - 1.0], load, zi=[(1.0 - share) * load[0]])
+    return EncoderRecording(time, np.round(motor / count) * count, np.round(load / count) * count, load_unit="mm")

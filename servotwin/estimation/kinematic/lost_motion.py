@@ -14,6 +14,7 @@ from servotwin.estimation.kinematic.close_fit import fitted_closely, half_width
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
 from servotwin.estimation.kinematic.local import LocalGap, drift_of, local_gaps
 from servotwin.estimation.kinematic.models import ModelScore, chosen, undecided
+from servotwin.estimation.kinematic.one_speed import lag_of_gap
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
@@ -261,6 +262,7 @@ def _answer(
     close = fitted_closely(prepared, best, least)
     width = half_width(recording, prepared, close)
     gap, ratio, residual, rows = close.gap, close.ratio, close.residual, prepared.rows
+    lag = prepared.lag + lag_left(prepared, close.fit, close.places)
     judged = verdict(
         KinematicFit(
             gap=gap,
@@ -275,6 +277,7 @@ def _answer(
             accelerated=INERTIA in best.model.used,
             lead=_lead(prepared),
             richer=tuple(each.gap for each in undecided(best, comparisons[:-1])),
+            as_lag=lag_of_gap(prepared, close, lag),
             reach=float(np.ptp(np.quantile(recording.motor[rows] - close.values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,
@@ -288,7 +291,7 @@ def _answer(
         interval_motor=judged.interval,
         ratio=ratio,
         load_spread=max(width.at_load / (half * abs(ratio)), 1.0) if half else 1.0,
-        lag=prepared.lag + lag_left(prepared, close.fit, close.places),
+        lag=lag,
         status=judged.status,
         reasons=judged.reasons,
         model=best.model.name,

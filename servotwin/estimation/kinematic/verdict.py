@@ -30,6 +30,33 @@ _COUNTS = 4.0
 _SAID = {LAG: "a lag of the load", WIND_UP: "wind-up by the command", INERTIA: "wind-up by acceleration"}
 
 
+class LagOfGap(NamedTuple):
+    """The lag that does to a load what the gap does, and by how much the gap deviates for its sake.
+
+    Attributes
+    ----------
+    speed : float
+        Of the motor, the mean over its way, its unit per second.
+    delay : float
+        s, by which a load without a gap would be later.
+    deviation : float
+        Of the gap, the motor's unit: what the form of a lag does to the load, over the share of the flanks that no
+        lag explains.
+    """
+
+    speed: float
+    delay: float
+    deviation: float
+
+    def said(self, gap: float, unit: str) -> str:
+        """Say that it may be there in place of a gap."""
+        return (
+            f"the motor moved steadily at one speed only, about {self.speed:.3g} {unit}/s: a load that is later by "
+            f"{1e3 * self.delay:.3g} ms looks like {gap:.3g} {unit} of gap; record a second speed, half of it or less, "
+            "or rests after moves"
+        )
+
+
 class KinematicFit(NamedTuple):
     """A fitted model; gaps and counts in the motor's unit.
 
@@ -54,6 +81,8 @@ class KinematicFit(NamedTuple):
         From the least to the largest lead of the motor over the load: no gap that the load takes up is larger.
     accelerated : bool
         The model has wind-up by acceleration.
+    as_lag : LagOfGap or None
+        None: not looked for.
     richer : tuple of float
         Gaps of richer models that predict unseen strokes better, but not by enough to be chosen.
     lead : float
@@ -73,6 +102,7 @@ class KinematicFit(NamedTuple):
     accelerated: bool
     lead: float
     richer: tuple[float, ...] = ()
+    as_lag: LagOfGap | None = None
 
     @property
     def differs(self) -> bool:
@@ -100,18 +130,19 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
     gaps = (fit.gap, *fit.richer)
     low, high = min(gaps) - fit.half, max(gaps) + fit.half
     none = low <= 0.0 or not fit.of_none < 1.0
+    lag = fit.as_lag if fit.as_lag is not None and low <= _DISAGREE * fit.as_lag.deviation else None
     if fit.left > max(_LEFT_AT_MOST * fit.gap, _COUNTS * fit.quantisation):
         reason = (
             f"the load deviates by {fit.left:.3g} {unit} (rms, at the motor) from following the motor through a gap of "
             f"{fit.gap:.3g} {unit}: it swings or winds up; record a slow motion, or give the machine (--servo)"
         )
         return KinematicVerdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
-    if none:
+    if none or lag is not None:
         # A load that hunts spoils the fit; no gap that it takes up is larger than the largest lead.
         high = max(high, 3.0 * fit.left, fit.reach, *(gap + fit.half for gap in fit.simpler.values()))
-        return KinematicVerdict(
-            GapStatus.UNIDENTIFIABLE, (0.0, high), (f"the gap cannot be told from none: at most {high:.3g} {unit}",)
-        )
+        reason = f"the gap cannot be told from none: at most {high:.3g} {unit}"
+        because = () if none or lag is None else (lag.said(fit.gap, unit),)
+        return KinematicVerdict(GapStatus.UNIDENTIFIABLE, (0.0, high), (*because, reason))
     reasons = _doubts(fit, unit)
     if not reasons and not fit.differs:
         return KinematicVerdict(GapStatus.OK, (max(low, 0.0), high))
