@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as jsons
 import ssl
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -169,7 +169,7 @@ def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
         summary, traces = known_servo(store, servo), store.audit(servo, limit=limit)
         if not traces:
             return _ServoEvidence({}, [], [], {})
-        events = store.events(servo, _since(traces[-1].window.received), MAX_ROWS)
+        events = store.events(servo, _since(trace.window.received for trace in traces), MAX_ROWS)
         series = store.reading(lambda connection: machine_series(connection, servo, 1))
         return _ServoEvidence(
             summary._asdict(),
@@ -187,14 +187,15 @@ def _read_service(servo: str, source: Source, limit: int) -> _ServoEvidence:
     summary = get_json(f"/v1/servos/{name}")
     if not traces:
         return _ServoEvidence({}, [], [], {})
-    since = _since(traces[-1]["window"]["received"])
+    since = _since(trace["window"]["received"] for trace in traces)
     events = get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
     return _ServoEvidence(summary, traces, events, get_json(f"/v1/servos/{name}/gaps?limit=1").get("machine", {}))
 
 
-def _since(oldest: float) -> float:
+def _since(received: Iterable[float]) -> float:
     """Time from which events are read: an edge starts before its first window."""
-    return max(0.0, oldest - _BEFORE_S)
+    # Where the clock was set back, the oldest window is not that of the earliest time.
+    return max(0.0, min(received) - _BEFORE_S)
 
 
 def _json_client(source: Source) -> Callable[[str], Any]:

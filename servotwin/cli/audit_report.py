@@ -1,19 +1,19 @@
-"""Evidence chain as text: one line per window in order of time, with its consequences."""
+"""Evidence chain as text: one line per window in the order of the store, with its consequences."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
+from servotwin.cli.audit_events import Place, event_line, in_force_since, placing, utc
 from servotwin.config.keys import items_of
 from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.messages import Cause, Reason
+from servotwin.messages import Reason
 from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
 
 DEG = 180.0 / math.pi
@@ -23,8 +23,8 @@ _NO_ESTIMATE = "no estimate"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
 JsonObject = Mapping[str, Any]
 """A servo, the trace of a window or a piece of evidence, as the API returns it."""
-Entry = tuple[float, str, str]
-"""Time (s since the epoch), boot (empty: of none), and the line."""
+Entry = tuple[Place, str, str]
+"""Place in the order of the store, boot (empty: of none), and the line."""
 
 
 _POSITIONS = {each.si: each.small for each in (MILLIMETRES, DEGREES)}
@@ -101,7 +101,8 @@ def lines_of(
     yield from _head(servo, traces, events, units)
     chosen = [trace for trace in traces if not changes or _matters(trace)]
     entries = [entry for trace in chosen for entry in _window(trace, units)]
-    entries += [_event(event, units) for event in events]
+    place = placing(traces, events)
+    entries += [(place(event), "", event_line(event, units)) for event in events]
     if changes and not chosen:
         yield f"  none of the newest {len(traces)} windows led to more than an estimate; --limit 1000 looks further"
     yield ""
@@ -128,7 +129,7 @@ def servo_lines(servos: Sequence[JsonObject]) -> Iterator[str]:
 
 def _servo_row(servo: JsonObject) -> tuple[str, ...]:
     version = "-" if servo["version"] is None else str(servo["version"])
-    received = "never" if servo["last_message"] is None else _time(servo["last_message"])
+    received = "never" if servo["last_message"] is None else utc(servo["last_message"])
     return (
         servo["servo"], _gap(servo) or "-", _status(servo) or _NO_ESTIMATE, version, servo["receipt"] or "-",
         str(servo["waiting"]), received,
@@ -146,10 +147,10 @@ def _head(servo: JsonObject, traces: Sequence[JsonObject], events: Sequence[Json
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
     answer = _newest_answer(servo, traces)
     receipt = f" ({answer})" if answer else ""
-    last = "" if servo["last_message"] is None else f", last message {_time(servo['last_message'])} UTC"
+    last = "" if servo["last_message"] is None else f", last message {utc(servo['last_message'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
     yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
-    if fallen := _in_force_since(traces, events):
+    if fallen := in_force_since(traces, events):
         yield f"  {fallen}"
     newest = _wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"), units)
     if any(newest):
@@ -164,20 +165,6 @@ def _newest_answer(servo: JsonObject, traces: Sequence[JsonObject]) -> str:
         return str(servo["receipt"])
     receipts = [answer["status"] for answer in step["answers"] if answer["kind"] == "receipt"]
     return receipts[-1] if receipts else "not answered yet"
-
-
-def _in_force_since(traces: Sequence[JsonObject], events: Sequence[JsonObject]) -> str:
-    """Sentence on the fallback set while it is in force, also of a later boot; empty: another version is."""
-    fallen = max((one for one in events if one["kind"] == "fallback"), key=lambda one: one["created"], default=None)
-    if fallen is None:
-        return ""
-    answers = (answer for trace in traces for step in trace["steps"] for answer in step["answers"])
-    applied = (one for one in answers if one["kind"] == "receipt" and (one["body"] or {}).get("applied"))
-    version = (fallen["body"] or {}).get("parameter_version")
-    others = (one for one in events if one["kind"] == "hello" and one["version"] != version)
-    if any(one["created"] > fallen["created"] for one in (*applied, *others)):
-        return ""
-    return f"the edge runs its fallback set since {_time(fallen['created'])} UTC: {fallen['status']}"
 
 
 def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
@@ -217,10 +204,11 @@ def _window(trace: JsonObject, units: Units) -> Iterator[Entry]:
     version = "" if estimate is None or estimate["version"] is None else estimate["version"]
     width = max(9, len(units.error))
     values = f"{_gap(estimate):>15}  {_error(estimate, units):>{width}}  {version:>7}"
-    line = f"{_time(window['received'])}  {window['sequence']:>6}  {values}  {remarks[0]}".rstrip()
-    yield window["received"], window["boot"], line
+    place = window["id"], 0
+    line = f"{utc(window['received'])}  {window['sequence']:>6}  {values}  {remarks[0]}".rstrip()
+    yield place, window["boot"], line
     for remark in remarks[1:]:
-        yield window["received"], window["boot"], f"{'':{len(head) - len('what followed')}}{remark}"
+        yield place, window["boot"], f"{'':{len(head) - len('what followed')}}{remark}"
 
 
 def _estimate(trace: JsonObject) -> JsonObject | None:
@@ -345,37 +333,6 @@ def _effect(effect: JsonObject, units: Units) -> str:
     return f"version {after['version']} in window {window['sequence']}: error {errors}"
 
 
-def _event(one: JsonObject, units: Units) -> Entry:
-    kind, body = one["kind"], one["body"] or {}
-    if kind == "hello":
-        text = f"edge connected: boot {one['status']}, version {one['version']} in force"
-    elif kind == "fallback":
-        now = f"; version {body['parameter_version']} in force" if "parameter_version" in body else ""
-        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}{now}"
-    elif kind == "answer":
-        text = f"the edge answers a request: {one['status']}"
-    elif kind == "alarm":
-        text = f"ALARM: {one['status']}"
-    else:
-        text = one["status"] or kind
-    return one["created"], "", f"{_time(one['created'])}  {text}"
-
-
-def _measured(body: JsonObject, units: Units) -> str:
-    """Measured and allowed value, in the cause's unit."""
-    if body.get("cause") in (Cause.DRIVE, Cause.CONFLICT):
-        return ""
-    small = units.position
-    known = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, units.command)}
-    scale, unit = known.get(body.get("cause", ""), (small.factor, small.name))
-    if not unit:
-        return ""
-    try:
-        return f", {body['measured'] * scale:.4g} {unit} where {body['allowed'] * scale:.4g} {unit} are allowed"
-    except (KeyError, TypeError):
-        return ""
-
-
 def _failed(one: JsonObject) -> bool:
     return str(one["status"]).startswith("failed: ")
 
@@ -391,7 +348,3 @@ def _error(estimate: JsonObject | None, units: Units) -> str:
     if estimate is None or estimate["tail"] is None or not units.position.name:
         return "?"
     return f"{estimate['tail'] * units.position.factor:.1f}"
-
-
-def _time(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -216,7 +216,7 @@ def _fallen(fallback: StoredEvidence | None, in_force: int | None) -> tuple[Flee
     """Tell that the edge runs its fallback set; nothing where another version is in force."""
     if fallback is None or in_force is None or _version_of(fallback, "fallback") != in_force:
         return ()
-    return (FleetAlarm(fallback.created, f"the edge runs its fallback set: {fallback.status}"),)
+    return (FleetAlarm(fallback.time, f"the edge runs its fallback set: {fallback.status}"),)
 
 
 def _alarms(records: tuple[StoredEvidence, ...]) -> tuple[FleetAlarm, ...]:

@@ -118,7 +118,7 @@ def _version(update: StoredEvidence, receipt: StoredEvidence | None) -> Row:
         "version": update.version,
         "sent": update.created,
         "gap": finite(update.gap),
-        "answered": None if receipt is None else receipt.created,
+        "answered": None if receipt is None else receipt.time,
         "applied": applied if isinstance(applied, bool) else None,
         "reason": "" if receipt is None else receipt.status,
     }
@@ -127,7 +127,7 @@ def _version(update: StoredEvidence, receipt: StoredEvidence | None) -> Row:
 def fallbacks(decisions: Sequence[StoredEvidence]) -> list[Row]:
     """One row per fallback of the edge: when it was reported, its cause, and the version that was left."""
     return [
-        {"time": record.created, "cause": record.status, "version": record.version}
+        {"time": record.time, "cause": record.status, "version": record.version}
         for record in decisions
         if record.kind == "fallback"
     ]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from servotwin.store.queries import evidence_of_row, servo_summaries
+from servotwin.store.queries import evidence_columns, evidence_of_row, servo_summaries
 from servotwin.store.records import ServoSummary, StoredEvidence, StoredWindow
 from servotwin.store.schema import WINDOWS, evidence, messages, twins
 
@@ -16,7 +16,7 @@ _NEWEST = ("trend",)
 """Kinds whose rows have no version: the newest is found in the index at once."""
 _VERSIONED = ("hello", "receipt", "fallback")
 """Kinds that report the version in force."""
-_COLUMNS = tuple(evidence.c[name] for name in StoredEvidence._fields)
+_COLUMNS = tuple(evidence_columns(evidence))
 _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
 
@@ -138,7 +138,8 @@ def gaps(
     selected = chosen.order_by(messages.c.id.desc()).limit(limit).cte("chosen")
     # The body of a redesign holds its simulations: much, and not needed here.
     body = sa.case((evidence.c.kind == "redesign", b""), else_=evidence.c.body) if bodies else sa.literal(b"")
-    columns = [body.label("body") if column.name == "body" else column for column in _COLUMNS]
+    known = evidence_columns(evidence, letters=False)
+    columns = [body.label("body") if column.name == "body" else column for column in known]
     wanted = sa.and_(evidence.c.message == selected.c.id, evidence.c.kind.in_((*_ESTIMATES, "trend", "redesign")))
     query = sa.select(*selected.c, *(column.label(f"e_{column.name}") for column in columns))
     query = query.select_from(selected.outerjoin(evidence, wanted)).order_by(selected.c.id, evidence.c.id)

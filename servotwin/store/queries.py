@@ -24,6 +24,7 @@ from servotwin.store.schema import contexts as context_table
 
 _ESTIMATES = ("glance", "estimate")
 _ANSWERS = ("receipt", "fallback")
+_LETTERS = (MessageKind.LETTER.value, MessageKind.ACT.value)
 _APPLIED = Reason.APPLIED.value
 _EVENTS = ("hello", "fallback", "answer", "act")
 """Kinds of evidence that an edge reports by itself, not about a window, and acts of engineers."""
@@ -92,10 +93,13 @@ def contexts(connection: sa.Connection, keys: Collection[str]) -> dict[str, str]
 
 
 def events(connection: sa.Connection, servo: str, since: float, limit: int) -> list[StoredEvidence]:
-    """Evidence that belongs to no window, newest first."""
-    columns = [evidence.c[name] for name in StoredEvidence._fields]
+    """Evidence that belongs to no window, from the first of a time on in the order of the store, newest first."""
+    columns = evidence_columns(evidence)
     apart = sa.or_(evidence.c.kind.in_(_EVENTS), evidence.c.message.is_(None))
-    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.created >= since)
+    found = sa.and_(evidence.c.servo == servo, apart)
+    # Not by time: what came after the clock was set back came later.
+    first = sa.select(sa.func.min(evidence.c.id)).where(found, evidence.c.created >= since).scalar_subquery()
+    query = sa.select(*columns).where(found, evidence.c.id >= first)
     rows = connection.execute(query.order_by(evidence.c.id.desc()).limit(limit)).all()
     return [record for row in rows if (record := _evidence(row, 0)) is not None]
 
@@ -139,7 +143,9 @@ def _chain(servo: str, selected: sa.CTE) -> sa.Select[Any]:
     joined = joined.outerjoin(later, later.c.id == after.c.message)
     columns = [
         *selected.c,
-        *(alias.c[name] for alias in (found, answer, after) for name in StoredEvidence._fields),
+        *evidence_columns(found, letters=False),
+        *evidence_columns(answer),
+        *evidence_columns(after, letters=False),
         *(later.c[name] for name in StoredWindow._fields),
     ]
     labelled = [column.label(f"c{i}") for i, column in enumerate(columns)]
@@ -193,6 +199,14 @@ def evidence_of_row(row: Any) -> StoredEvidence:
     """The evidence in the first columns of a row, null as the empty value."""
     record = StoredEvidence(*row[:_EVIDENCE_WIDTH])
     return record._replace(message=record.message or 0, context=record.context or "")
+
+
+def evidence_columns(table: sa.FromClause, letters: bool = True) -> list[sa.ColumnElement[Any]]:
+    """Columns of `StoredEvidence`; not `letters`: of evidence of windows, which has none that led to it."""
+    letter = messages.alias("letter")
+    came = sa.select(letter.c.received).where(letter.c.id == table.c.message, letter.c.kind.in_(_LETTERS))
+    received: sa.ColumnElement[Any] = came.correlate(table).scalar_subquery() if letters else sa.null()
+    return [*(table.c[name] for name in StoredEvidence._fields[:-1]), received.label("received")]
 
 
 def _is_window(servo: str, boot: str, sequence: int) -> sa.ColumnElement[bool]:

@@ -264,7 +264,15 @@ class StoredWindow(NamedTuple):
 
 
 class StoredEvidence(NamedTuple):
-    """Evidence in the store; `created`: s since the epoch, the other fields as in `EvidenceRecord`."""
+    """Evidence in the store; the fields that are not here are those of `EvidenceRecord`.
+
+    Attributes
+    ----------
+    created : float
+        s since the epoch, when it was stored.
+    received : float or None
+        s since the epoch, when the letter or act came that led to it; None: none did, or it was not asked for.
+    """
 
     id: int
     kind: str
@@ -277,6 +285,12 @@ class StoredEvidence(NamedTuple):
     context: str
     tail: float | None
     created: float
+    received: float | None = None
+
+    @property
+    def time(self) -> float:
+        """s since the epoch at which its letter was received, or it was stored: under load long after that."""
+        return self.created if self.received is None else self.received
 
 
 class UpdateEffect(NamedTuple):

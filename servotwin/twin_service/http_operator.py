@@ -274,12 +274,15 @@ def trace_as_json(trace: WindowTrace) -> dict[str, Any]:
 
 
 def evidence_as_json(record: StoredEvidence) -> dict[str, Any]:
-    """A piece of evidence for JSON, its body decoded; null where it cannot be."""
+    """A piece of evidence for JSON, its body decoded; null where it cannot be. `received`: where a letter led to it."""
     try:
         body = msgspec.msgpack.decode(record.body)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         body = None
-    return {**record._asdict(), "body": body}
+    row = {**record._asdict(), "body": body}
+    if record.received is None:
+        del row["received"]
+    return row
 
 
 def limit_of(request: HttpRequest) -> int:

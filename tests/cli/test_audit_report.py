@@ -29,7 +29,8 @@ HEAD = Units().head
 
 
 def found(kind: str, status: str = "", **values: Any) -> dict[str, Any]:
-    nothing = {"version": None, "gap": None, "std": None, "tail": None, "created": 0.0, "body": None}
+    nothing = {"id": 0, "message": 0, "version": None, "gap": None, "std": None, "tail": None, "created": 0.0,
+               "body": None}  # fmt: skip
     return {"kind": kind, "status": status, **nothing, **values}
 
 
@@ -40,7 +41,7 @@ def estimate(status: str = "ok", **values: Any) -> dict[str, Any]:
 def link(
     number: int, *of: dict[str, Any], boot: str = "b1", done: float | None = 1.0, steps: Any = ()
 ) -> dict[str, Any]:
-    window = {"boot": boot, "sequence": number, "received": 60.0 * number, "done": done}
+    window = {"id": 60 * number, "boot": boot, "sequence": number, "received": 60.0 * number, "done": done}
     return {"window": window, "evidence": list(of), "steps": list(steps)}
 
 
@@ -160,7 +161,7 @@ def test_a_version_that_met_a_fallback_is_no_error() -> None:
 )
 def test_a_fallback_is_listed_at_its_time(cause: Cause, measured: float, allowed: float, expected: str) -> None:
     body = {"cause": cause.value, "measured": measured, "allowed": allowed}
-    events = [found("fallback", cause.value, version=3, body=body, created=90.0)]
+    events = [found("fallback", cause.value, version=3, body=body, created=95.0, received=90.0, message=90)]
     lines = chain(link(1, estimate()), link(2, estimate()), events=events)
     assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {expected}"
 
@@ -174,11 +175,11 @@ def test_a_fallback_after_a_drive_s_refusal_shows_no_values() -> None:
 
 def test_starts_of_the_edge_and_faults_of_the_twin_are_listed() -> None:
     events = [
-        found("hello", "b2", version=3, made=70.0),
-        found("answer", "taken", made=80.0),
-        found("estimate", "failed: the state is not understood; the twin begins anew", created=90.0),
+        found("hello", "b2", version=3, created=70.0, message=70, id=2),
+        found("answer", "taken", created=80.0, message=80, id=3),
+        found("estimate", "failed: the state is not understood; the twin begins anew", created=90.0, id=4),
     ]
-    lines = chain(link(1, estimate()), link(2, estimate(), boot="b2"), events=events)
+    lines = chain(link(1, estimate(id=1)), link(2, estimate(id=5), boot="b2"), events=events)
     assert [line[21:] for line in lines if line.startswith("1970") and "7.5" not in line] == [
         "edge connected: boot b2, version 3 in force",
         "the edge answers a request: taken",
@@ -286,28 +287,57 @@ def test_the_summary_shows_the_answer_to_the_newest_version() -> None:
 
 
 FALLEN = found(
-    "fallback", "limit cycle", version=3, created=200.0,
+    "fallback", "limit cycle", version=3, id=20, message=110, created=230.0, received=200.0,
     body={"cause": Cause.LIMIT_CYCLE, "measured": 3e-4, "allowed": 1e-5, "parameter_version": 4, "boot": "b1"},
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("applied_at", "boot", "version", "runs"),
+    ("applied", "boot", "version", "runs"),
     [
-        (100.0, "b1", 0, True),
-        (300.0, "b1", 0, False),
-        (100.0, "b2", 4, True),  # the edge begins with what it stored
-        (100.0, "b2", 0, False),
+        (10, "b1", 0, True),
+        (30, "b1", 0, False),
+        (10, "b2", 4, True),  # the edge begins with what it stored
+        (10, "b2", 0, False),
     ],
 )
-def test_the_summary_says_that_the_fallback_set_runs(applied_at: float, boot: str, version: int, runs: bool) -> None:
-    applied = found("receipt", "applied", version=3, body={"applied": True}, created=applied_at)
-    hello = found("hello", boot, version=version, created=50.0 if boot == "b1" else 300.0)
-    lines = report_of(link(1, estimate(), steps=[step(None, applied)]), events=[FALLEN, hello])
+@pytest.mark.parametrize("ahead", [0.0, 5e6])
+def test_the_summary_says_that_the_fallback_set_runs(
+    applied: int, boot: str, version: int, runs: bool, ahead: float
+) -> None:
+    """Whatever the clock said: of two letters the later one of the store counts."""
+    clock = {n: {"id": n, "created": 10.0 * n + (ahead if n < 20 else 0.0) - (ahead if n > 20 else 0.0)}
+             for n in (5, 10, 30)}  # fmt: skip
+    receipt = found("receipt", "applied", version=3, body={"applied": True}, **clock[applied])
+    hello = found("hello", boot, version=version, **clock[5 if boot == "b1" else 30])
+    lines = report_of(link(1, estimate(), steps=[step(None, receipt)]), events=[FALLEN, hello])
     said = "  the edge runs its fallback set since 1970-01-01 00:03:20 UTC: limit cycle"
-    assert (said in lines) is runs
+    assert [line for line in lines if "runs its fallback set" in line] == ([said] if runs else [])
     reported = "FALLBACK from version 3: limit cycle, 300 um where 10 um are allowed; version 4 in force"
     assert sum(reported in line for line in lines) == 1
+
+
+def test_letters_of_one_turn_are_in_the_order_in_which_they_came() -> None:
+    """At the time of their receipt, though both were processed later, and after a window that came after them."""
+    hello = found("hello", "b1", version=4, id=21, message=111, created=230.0, received=201.0)
+    mended = found("estimate", "failed: the state is not understood; the twin begins anew", id=22, created=230.0)
+    windows = link(1, estimate(id=1)), link(2, estimate(id=19)), link(3, estimate(id=23))
+    lines = chain(*windows, events=[mended, hello, FALLEN])
+    told = [line[11:] for line in lines if line.startswith("1970")]
+    assert [line[:30] for line in told] == [
+        told[0][:30],
+        "00:03:20  FALLBACK from versio",
+        "00:03:21  edge connected: boot",
+        told[3][:30],
+        "00:03:50  failed: the state is",
+        told[5][:30],
+    ]
+
+
+def test_an_earlier_service_tells_no_time_of_receipt() -> None:
+    fallen = {key: value for key, value in FALLEN.items() if key != "received"}
+    lines = report_of(link(1, estimate()), events=[fallen])
+    assert any("fallback set since 1970-01-01 00:03:50 UTC" in line for line in lines)
 
 
 def test_the_list_of_servos_cuts_no_word() -> None:

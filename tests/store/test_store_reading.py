@@ -205,3 +205,18 @@ def test_events_that_belong_to_no_window(store: Store) -> None:
     ]  # fmt: skip
     assert [one.kind for one in store.events("a", limit=1)] == ["estimate"]
     assert store.events("a", since=202.0) == store.events("nobody") == []
+    assert [one.received for one in store.events("a")] == [None, first.messages[0].received, first.messages[0].received]
+
+
+@pytest.mark.slow
+def test_events_after_the_clock_was_set_back_are_later_ones(store: Store) -> None:
+    """They follow in the order of the store."""
+    store.put([letter()])
+    first = claim(store, servo="a")[0]
+    word = first.messages[0].id
+    assert store.commit([outcome(first, EvidenceRecord("fallback", word, b"f", version=1))], 5e6) == [True]
+    store.put([letter(body=b"later")])
+    second = claim(store, servo="a")[0]
+    word = second.messages[0].id
+    assert store.commit([outcome(second, EvidenceRecord("hello", word, b"h", version=2))], 300.0) == [True]
+    assert [one.kind for one in store.events("a", since=4e6)] == ["hello", "fallback"]

@@ -117,5 +117,5 @@ const HAPPENED = {
 export function eventList(events) {
   if (!events.length) return element("p", { class: "soft" }, "Nothing but windows and updates.");
   return element("table", {}, element("tbody", {}, events.map((one) =>
-    element("tr", {}, cell(stamp(one.created), true), cell((HAPPENED[one.kind] ?? ((each) => each.status || each.kind))(one))))));
+    element("tr", {}, cell(stamp(one.received ?? one.created), true), cell((HAPPENED[one.kind] ?? ((each) => each.status || each.kind))(one))))));
 }
