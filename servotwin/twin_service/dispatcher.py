@@ -9,15 +9,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, WorkResult
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.monitoring import Metrics, utc
 from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerProcess
@@ -361,12 +361,12 @@ class Dispatcher:
         for kind, number in Counter(map(log_kind, result.evidence)).items():
             self._metrics.evidence.add(kind, by=number)
         about = {"servo": lease.servo, "serial": lease.serial, "seconds": round(seconds, 6)}
-        windows = {message.id: message.key for message in lease.messages if message.kind is MessageKind.WINDOW}
+        sources = {message.id: message for message in lease.messages}
         for record in result.evidence:
             kind = log_kind(record)
             level = logging.WARNING if kind in ALARMS else logging.DEBUG if kind in QUIET else logging.INFO
             if log.isEnabledFor(level):
-                log.log(level, kind, extra={**about, **_identifiers(record, windows)})
+                log.log(level, kind, extra={**about, **_identifiers(record, sources.get(record.message))})
 
 
 _Queue = tuple[str, str]
@@ -386,11 +386,12 @@ def log_kind(record: EvidenceRecord) -> str:
     return "failed" if record.status.startswith("failed") else record.kind
 
 
-def _identifiers(record: EvidenceRecord, windows: Mapping[int, str]) -> dict[str, object]:
-    """Window, version and context of evidence, as far as it has them; an estimate is known by its message."""
+def _identifiers(record: EvidenceRecord, source: StoredMessage | None) -> dict[str, object]:
+    """Message, with its receipt, window, version and context of evidence, as far as it has them."""
     known = {
         "message_id": record.message,
-        "window": windows.get(record.message),
+        "received": source and utc(source.received),  # under load long before this line
+        "window": source.key if source is not None and source.kind is MessageKind.WINDOW else None,
         "version": record.version,
         "status": record.status,
         "context": record.context,

@@ -209,6 +209,11 @@ class Metrics:
         )
 
 
+def utc(seconds: float) -> str:
+    """A time (s since the epoch) as log lines state it."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
 class _JsonLines(logging.Formatter):
     """Formats a record as one JSON object: time, level, where, message and the fields of `extra`.
 
@@ -219,7 +224,7 @@ class _JsonLines(logging.Formatter):
         """Return one line."""
         extra = {key: value for key, value in vars(record).items() if key not in _STANDARD}
         line: dict[str, Any] = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "time": utc(record.created),
             "level": record.levelname.lower(),
             "where": record.name,
             "message": record.getMessage(),

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import httpx
@@ -13,8 +14,10 @@ from service_system import bearer, place, twin_file, unpacked, window
 
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import EvidenceRecord, MessageKind, StoredMessage
 from servotwin.store.store import open_store
 from servotwin.twin_service import dispatcher
+from servotwin.twin_service.dispatcher import _identifiers
 from servotwin.twin_service.pace import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
@@ -92,6 +95,7 @@ def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_process
             assert 'servotwin_evidence_total{kind="estimate"} 11\n' in counted
             [alarm] = [record for record in caplog.records if record.message == "failed"]
             assert (alarm.levelname, alarm.servo, alarm.window) == ("WARNING", "ax-1", "b/3")
+            assert alarm.received < datetime.fromtimestamp(alarm.created, UTC).isoformat(timespec="milliseconds")
             assert "work failed" in caplog.messages
             assert ("worker replaced" in caplog.messages) == (fault != "raise")
 
@@ -176,3 +180,13 @@ def test_at_most_two_verifications_start_at_once_and_then_at_their_rate():
     assert begun[:2] == [0.01, 0.02]
     assert len(begun) == 2 + 5
     assert not VerificationQuota(0.0).refill(1e6)
+
+
+def test_the_line_of_a_letter_tells_when_it_came() -> None:
+    """The line itself comes at the servo's turn."""
+    letter = StoredMessage(7, MessageKind.LETTER, b"", "", 90.0)
+    fallen = EvidenceRecord("fallback", 7, b"", version=3, status="the twin is silent")
+    told = _identifiers(fallen, letter)
+    assert told["received"] == "1970-01-01T00:01:30.000+00:00"
+    assert "window" not in told
+    assert "received" not in _identifiers(fallen, None)
