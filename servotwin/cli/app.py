@@ -2,7 +2,7 @@
 
 A new command is a function in `commands` that imports what it needs in its body, and a line in the table below. User
 errors are raised as `InvalidInput` anywhere below; `_Commands` turns them, and errors of usage, into one sentence and
-exit code 2, and an interrupt into 130.
+exit code 2, and an interrupt into 130, another signal into 128 and its number.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Commands(TyperGroup):
                 raise
             _end(f"error: {missing_extra(str(error.name), f'servotwin {ctx.invoked_subcommand}')}", INVALID)
         except KeyboardInterrupt as interrupt:
-            _end(str(interrupt) or _INTERRUPT, INTERRUPTED)
+            _end(str(interrupt) or _INTERRUPT, getattr(interrupt, "code", INTERRUPTED))
 
     def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
         alone = not args  # shows the help

@@ -166,8 +166,9 @@ def enroll(
             folders, written = [request.folder], enrolment.enroll(config, request)
     for path in written:
         print(f"written: {path}")
+    new = set(written)
     for path in (folder / enrolment.CONFIG for folder in folders):
-        if path not in written:
+        if path not in new:
             print(f"kept: {path}, with the limits and options of its enrolment; for others give --edge a new folder")
 
 

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import hmac
 import logging
+import os
 import re
 import secrets
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from servotwin.config.files import check_private
@@ -314,13 +317,24 @@ def write_tokens(path: Path, verifiers: Verifiers) -> None:
 
 @contextmanager
 def tokens_locked(path: Path) -> Iterator[None]:
-    """Hold the lock of a file of tokens, to read and replace it; raises InvalidInput where no lock can be made."""
+    """Hold the lock of a file of tokens, to read and replace it; raises InvalidInput where no lock can be made.
+
+    A wait of more than a second is said on the standard error.
+    """
     with ExitStack() as stack:
         try:
-            stack.enter_context(locked(lock_beside(path), wait=True))
+            lock = stack.enter_context(locked(lock_beside(path), wait=True, waiting=partial(_say_waiting, path)))
+            os.ftruncate(lock, 0)
+            os.pwrite(lock, b"%d" % os.getpid(), 0)  # for the sentence of those that wait
         except OSError as error:
             raise InvalidInput(f"{lock_beside(path)}: cannot be made ({error.strerror})") from None
         yield
+
+
+def _say_waiting(path: Path, lock: int) -> None:
+    holder = os.pread(lock, 20, 0).decode(errors="replace")
+    who = f"process {holder}" if holder.isdecimal() else "another process"
+    print(f"{path}: locked by {who}, an enrolment or revocation; waiting for its end", file=sys.stderr, flush=True)
 
 
 def _read_fleet(table: Table) -> str:
@@ -348,9 +362,9 @@ def _read_verifier(table: Table, name: str) -> bytes:
     return bytes.fromhex(value)
 
 
-def write_private(path: Path, text: str) -> None:
-    """Write a file of mode 0600 atomically and durably; raises InvalidInput where that fails."""
+def write_private(path: Path, text: str, durable: bool = True) -> None:
+    """Write a file of mode 0600 atomically and, by default, durably; raises InvalidInput where that fails."""
     try:
-        replace_file(path, text.encode(), durable=True, mode=PRIVATE)
+        replace_file(path, text.encode(), durable=durable, mode=PRIVATE)
     except OSError as error:
         raise InvalidInput(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from servotwin.config.named_file import check_named
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
-from servotwin.twin_service.auth import write_private, write_tokens
+from servotwin.runtime.signals import end_signals
+from servotwin.twin_service.auth import Verifiers, write_private, write_tokens
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.up.enrolment import (
     CERTIFICATE,
     CONFIG,
     TOKEN,
+    Enroller,
     Enrolment,
     StatedNoise,
     drive_of,
-    edge_file_text,
     open_tokens,
-    write_folder,
+    present_tokens,
 )
 
 _ALL = 20
@@ -97,7 +103,8 @@ def enroll_all(twin_path: Path, source: Path, requests: Mapping[int, Enrolment])
     """Enrol all servos with the twin of a file, and return the files that were written.
 
     Every row is checked before anything is written. The tokens become valid together, at the end; where a file cannot
-    be written, all folders are left as they were.
+    be written, or a signal ends the command, all folders are left as they were. The file of tokens is locked while the
+    folders are written only.
 
     Parameters
     ----------
@@ -111,24 +118,56 @@ def enroll_all(twin_path: Path, source: Path, requests: Mapping[int, Enrolment])
     InvalidInput
         Some rows are not allowed: one sentence for each, with its line; or a file cannot be written.
     """
-    twin, faults = read_twin(twin_path), dict[int, str]()
-    with open_tokens(twin) as (tokens, known):
-        texts = dict[int, str]()
-        for line, request in requests.items():
-            with _collected(faults, line):
-                texts[line] = edge_file_text(twin, request, known)
-        _require_none(source, faults)
-        with _all_or_nothing(requests.values()):
-            written, verifiers = list[Path](), dict[str, bytes]()
-            for line, request in requests.items():
-                try:
-                    files, verifiers[request.servo] = write_folder(twin, request, texts[line])
-                except (InvalidInput, OSError) as error:
-                    _require_none(source, {line: str(error)})
-                    raise
-                written += files
-            write_tokens(tokens, replace(known, servos={**known.servos, **verifiers}))
+    with end_signals() as signals, _progress() as progress:
+        twin = read_twin(twin_path)
+        rows = _Rows(Enroller(twin), source, requests, progress)
+        rows.check(present_tokens(twin), "checking")
+        with open_tokens(twin) as (tokens, known):
+            rows.check(known, "checking again")  # others may have enrolled meanwhile
+            with _all_or_nothing(requests.values()):
+                written, verifiers = rows.write()
+                os.sync()  # once for all, which is quicker: an edge has its token before the twin knows it
+                signals.ignore()
+                write_tokens(tokens, replace(known, servos={**known.servos, **verifiers}))
     return [*written, tokens]
+
+
+class _Rows:
+    """Requests of a file, with the texts of their edge.toml once they are checked."""
+
+    def __init__(self, enroller: Enroller, source: Path, requests: Mapping[int, Enrolment], progress: Progress) -> None:
+        self._enroller, self._source, self._requests, self._progress = enroller, source, requests, progress
+        self._texts = dict[int, str]()
+
+    def check(self, known: Verifiers, doing: str) -> None:
+        """Check all rows, and make the texts that are not made; raises InvalidInput."""
+        faults = dict[int, str]()
+        for line, request in self._each(doing):
+            with _collected(faults, line):
+                self._texts[line] = self._enroller.text(request, known, self._texts.get(line, ""))
+        _require_none(self._source, faults)
+
+    def write(self) -> tuple[list[Path], dict[str, bytes]]:
+        """Write all folders; return the files, and the tokens' verifiers by servo. Raises InvalidInput."""
+        written, verifiers = list[Path](), dict[str, bytes]()
+        for line, request in self._each("writing"):
+            try:
+                files, verifiers[request.servo] = self._enroller.write(request, self._texts[line], durable=False)
+            except (InvalidInput, OSError) as error:
+                _require_none(self._source, {line: str(error)})
+                raise
+            written += files
+        return written, verifiers
+
+    def _each(self, doing: str) -> Iterable[tuple[int, Enrolment]]:
+        return self._progress.track(self._requests.items(), total=len(self._requests), description=doing)
+
+
+def _progress() -> Progress:
+    """A bar on the standard error that disappears in the end; none where that is no terminal."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 _Column = Callable[[str], object]
@@ -141,7 +180,7 @@ def _columns(folder: Path) -> dict[str, tuple[str, _Column]]:
         "edge": ("folder", lambda text: folder / text),
         "role": ("role", str),
         "sample_rate_hz": ("sample_rate", _number("sample_rate_hz", "Hz", above=True)),
-        "drive": ("drive", lambda text: drive_of(folder / text)),
+        "drive": ("drive", cache(lambda text: drive_of(folder / text))),
         "url": ("url", str),
         "noise_um": ("noise", _noise("um")),
         "noise_mdeg": ("noise", _noise("mdeg")),

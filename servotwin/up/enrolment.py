@@ -119,30 +119,64 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
         The servo has no model, it has a token already, or a file cannot be written.
     """
     twin = read_twin(path)
+    enroller = Enroller(twin)
+    text = enroller.text(request, present_tokens(twin))
     with open_tokens(twin) as (tokens, known):
-        written, verifier = write_folder(twin, request, edge_file_text(twin, request, known))
+        written, verifier = enroller.write(request, enroller.text(request, known, text))
         write_tokens(tokens, replace(known, servos={**known.servos, request.servo: verifier}))
     return [*written, tokens]
 
 
-def edge_file_text(twin: TwinFile, request: Enrolment, known: Verifiers) -> str:
-    """Check a request, and return the text of its edge.toml; "" where there is one already.
+class Enroller:
+    """Makes the folders of edges; what edges of one model have in common is computed once.
 
-    Raises
-    ------
-    InvalidInput
-        The servo has no model, it or its folder has a token already, or no setting is verified for its stated range.
+    Parameters
+    ----------
+    twin : TwinFile
     """
-    _check(request, known)
-    return "" if (request.folder / CONFIG).exists() else edge_toml(_edge_config(twin, request))
+
+    def __init__(self, twin: TwinFile) -> None:
+        self._twin = twin
+        self._configs = dict[tuple[object, ...], EdgeConfig]()
+        self._certificates = dict[Path | None, Path | None]()
+
+    def text(self, request: Enrolment, known: Verifiers, made: str = "") -> str:
+        """Check a request, and return the text of its edge.toml (`made` before, if any); "" where there is one already.
+
+        Raises
+        ------
+        InvalidInput
+            The servo has no model, it or its folder has a token already, or no setting is verified for its stated
+            range.
+        """
+        _check(request, known)
+        return "" if (request.folder / CONFIG).exists() else made or edge_toml(self._config(request))
+
+    def write(self, request: Enrolment, text: str, durable: bool = True) -> tuple[list[Path], bytes]:
+        """Write the folder of an edge with a new token; return the files and the token's verifier."""
+        token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
+        written = _write_configuration(self._trusted(request), folder, text) if text else []
+        write_private(folder / TOKEN, token + "\n", durable)
+        return [*written, folder / TOKEN], verifier_of(token)
+
+    def _config(self, request: Enrolment) -> EdgeConfig:
+        model = _model_of(self._twin, request.servo)
+        key = model.name, request.role, request.sample_rate, repr(request.drive), request.url, request.noise, request.ca
+        if key not in self._configs:
+            self._configs[key] = _edge_config(self._twin, model, request, self._trusted(request))
+        config = self._configs[key]
+        return replace(config, agent=replace(config.agent, servo=request.servo), folder=request.folder)
+
+    def _trusted(self, request: Enrolment) -> Path | None:
+        if request.ca not in self._certificates:
+            self._certificates[request.ca] = _trusted_certificates(self._twin, request)
+        return self._certificates[request.ca]
 
 
-def write_folder(twin: TwinFile, request: Enrolment, text: str) -> tuple[list[Path], bytes]:
-    """Write the folder of an edge with a new token; return the files and the token's verifier."""
-    token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
-    written = _write_configuration(_trusted_certificates(twin, request), folder, text) if text else []
-    write_private(folder / TOKEN, token + "\n")
-    return [*written, folder / TOKEN], verifier_of(token)
+def present_tokens(twin: TwinFile) -> Verifiers:
+    """Read a twin's verifiers as they are now, without the lock."""
+    tokens = _tokens_file(twin)
+    return read_tokens(tokens) if tokens.exists() else Verifiers()
 
 
 @contextmanager
@@ -150,7 +184,7 @@ def open_tokens(twin: TwinFile) -> Iterator[tuple[Path, Verifiers]]:
     """Hold the lock of a twin's file of tokens; yield its path and verifiers, for `write_tokens`."""
     tokens = _tokens_file(twin)
     with tokens_locked(tokens):
-        yield tokens, read_tokens(tokens) if tokens.exists() else Verifiers()
+        yield tokens, present_tokens(twin)
 
 
 def enroll_operator(
@@ -210,16 +244,14 @@ def _model_of(twin: TwinFile, servo: str) -> ServoModel:
         raise InvalidInput(f"{twin.path}: {error}") from None
 
 
-def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
+def _edge_config(twin: TwinFile, model: ServoModel, request: Enrolment, certificates: Path | None) -> EdgeConfig:
     """Make the configuration of a servo's edge, with the supervision that the twin's policy requires.
 
     Raises
     ------
     InvalidInput
-        The servo has no model, its loop is unstable at the rate of the edge, or no setting is verified for its stated
-        range.
+        The loop is unstable at the rate of the edge, or no setting is verified for the stated range.
     """
-    model = _model_of(twin, request.servo)
     own = model.servo.controller
     rate = (own.sample_rate or _RATE) if request.sample_rate is None else request.sample_rate
     law = _running_law(own, request, rate)
@@ -230,7 +262,7 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S, most)
     commissioning.check_window()
     agent = commissioning.agent_settings(request.servo, UNBOOTED)
-    certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE
+    certificate = None if certificates is None else CERTIFICATE
     link = TwinLink(request.url or _url_of(twin.service), token_file=TOKEN, ca_file=certificate)
     units = own_units(servo)
     return EdgeConfig(

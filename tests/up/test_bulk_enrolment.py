@@ -1,7 +1,12 @@
 """Enrolling many servos from a CSV file: all or none."""
 
+import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from service_system import twin_file
@@ -13,8 +18,9 @@ from servotwin.edge_process.config_file import load
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.store.store import open_store
-from servotwin.twin_service.auth import Verifiers, read_tokens, write_tokens
+from servotwin.twin_service.auth import Verifiers, read_tokens, tokens_locked, write_tokens
 from servotwin.twin_service.command import check_fleet
+from servotwin.up import bulk_enrolment, enrolment
 
 URL = "https://twin:1"
 
@@ -171,3 +177,66 @@ def test_a_store_of_another_fleet_is_refused_in_one_sentence(folder: Path) -> No
         assert f"belongs to the fleet {own!r}" in str(refused.value)
         other.write_text(other.read_text().replace(foreign, own))
         check_fleet(store, other)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_leaves_all_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Also where it comes twice, as `timeout` and a closed terminal send it."""
+    kept = files(folder)
+    write, contents = enrolment.write_private, (folder / "tokens.toml").read_bytes()
+
+    def interrupted(path: Path, *others: Any) -> None:
+        write(path, *others)
+        if path.parent.name == "ax-2":
+            os.kill(os.getpid(), number)
+
+    def again(*others: Any) -> None:
+        os.kill(os.getpid(), number)
+        put_back(*others)
+
+    put_back = bulk_enrolment._put_back
+    monkeypatch.setattr(enrolment, "write_private", interrupted)
+    monkeypatch.setattr(bulk_enrolment, "_put_back", again)
+    former = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)}
+    for each in former:
+        signal.signal(each, signal.default_int_handler)  # the test must not end
+    try:
+        code, said, error = enroll(folder, "name\nax-1\nax-2\nax-3\n", "--url", URL)
+    finally:
+        for each, handler in former.items():
+            signal.signal(each, handler)
+    assert (code, said, error) == (128 + number, "", "interrupted; no partly written file is left\n")
+    assert files(folder) == kept
+    assert (folder / "tokens.toml").read_bytes() == contents
+
+
+def test_what_rows_have_in_common_is_computed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, make = list[str](), enrolment._edge_config
+    monkeypatch.setattr(enrolment, "_edge_config", lambda *given: made.append("") or make(*given))
+    rows = "name,noise_um\n" + "".join(f"ax-{each},{each % 2}\n" for each in range(10))
+    assert enroll(folder, rows, "--url", URL)[0] == 0
+    assert len(made) == 2
+    assert enroll(folder, "name,edge\nax-odd,one\n", "--url", URL, "--noise-um", "1")[0] == 0
+    texts = [(folder / name / "edge.toml").read_text() for name in ("ax-3", "one")]
+    assert texts[0].replace('"ax-3"', '"ax-odd"') == texts[1]
+
+
+def test_a_name_that_was_enrolled_meanwhile_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are checked before the file of tokens is locked, and once more with the lock."""
+    monkeypatch.setattr(bulk_enrolment, "present_tokens", lambda _twin: Verifiers())
+    code, _, error = enroll(folder, "name\nax-1\nax-old\n", "--url", URL)
+    assert code == 2
+    assert "line 3: 'ax-old' has a token already" in error
+    assert not (folder / "ax-1").exists()
+
+
+def test_whoever_waits_for_the_file_of_tokens_says_so(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with ThreadPoolExecutor(1) as other:
+        with tokens_locked(folder / "tokens.toml"):
+            revoked = other.submit(enrolment.revoke, folder / "twin.toml", "me")
+            time.sleep(1.5)
+            assert not revoked.done()
+        revoked.result()
+    said = f"{folder}/tokens.toml: locked by process {os.getpid()}, an enrolment or revocation; waiting for its end\n"
+    assert capfd.readouterr().err == said
+    assert not read_tokens(folder / "tokens.toml").operators
