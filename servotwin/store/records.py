@@ -99,6 +99,10 @@ class Lease(NamedTuple):
     estimate: bool = False
 
 
+TOO_LATE = "too late"
+"""Status of a redesign begins so, where nothing was computed because it would have come too late."""
+
+
 class EvidenceRecord(NamedTuple):
     """One piece of evidence: an estimate, a decision or an event of a twin.
 

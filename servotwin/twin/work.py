@@ -19,7 +19,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
 from servotwin.messages.acts import Act, ActKind, decode_act
 from servotwin.messages.codec import decompress
-from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import TOO_LATE, EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import ActRecord
 from servotwin.twin.evidence_rows import failure_row, rows
@@ -44,7 +44,7 @@ class Urgency:
     Attributes
     ----------
     expected_s : float
-        Time that the work for one servo takes.
+        Time from the begin of the work until the edge has decided on the update.
     speed : float
         Least ratio of sample time to real time.
     others_wait : bool
@@ -222,7 +222,7 @@ def _urgent(
         if not isinstance(event, WindowArrival):
             return event
         left = event.window.start + validity - done_at
-        late = f"too late by {-left:.3g} s: an update may be applied for {validity:g} s from the window's start"
+        late = f"{TOO_LATE} by {-left:.3g} s: an update may be applied for {validity:g} s from the window's start"
         overtaken = event is not newest
         return event._replace(
             overtaken=overtaken,

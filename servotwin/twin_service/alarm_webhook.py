@@ -17,7 +17,7 @@ from typing import Any
 from servotwin.errors import InvalidInput
 from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import WorkResult
-from servotwin.twin_service.dispatcher import ALARMS, log_kind
+from servotwin.twin_service.evidence_lines import ALARMS, log_kind
 from servotwin.twin_service.monitoring import Counter
 from servotwin.twin_service.webhook import (
     AlarmPost,

@@ -14,12 +14,14 @@ from contextlib import suppress
 from functools import partial
 
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
+from servotwin.twin_service.evidence_lines import count_evidence, write_evidence
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.monitoring import Metrics, utc
+from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.update_pace import UpdatePace
 from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerProcess
 from servotwin.twin_service.worker_pool import WorkerPool
 
@@ -34,10 +36,6 @@ _MESSAGES = 16
 """Messages of each servo in a job, at most."""
 _MAX_STEPS = 64
 """Results that one lock-step request may lead to."""
-QUIET = ("glance", "trend", "machine", "motor", "disturbance", "excitation")
-"""Evidence of every window: logged at level debug."""
-ALARMS = ("failed", "fallback", "withdrawn", "alarm")
-"""Evidence that somebody should look at: logged as warnings."""
 
 
 class NoResult(Exception):
@@ -61,6 +59,7 @@ class Dispatcher:
         Of the leases.
     quota : VerificationQuota
     pace : WorkPace, optional
+    updates : UpdatePace, optional
     paused : callable
         True while nothing new is to be begun.
     speed : float
@@ -84,6 +83,7 @@ class Dispatcher:
         owner: str,
         quota: VerificationQuota,
         pace: WorkPace | None = None,
+        updates: UpdatePace | None = None,
         speed: float = 1.0,
         paused: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -91,7 +91,7 @@ class Dispatcher:
         self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
         self._owner, self._quota = owner, quota
         self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
-        self._estimate_pace, self._estimates = WorkPace(), EstimateShare()
+        self._updates, self._estimates = updates or UpdatePace(lambda _servo: None, clocks), EstimateShare()
         self._deferred, self._next_job = set[str](), 0.0
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
@@ -252,13 +252,14 @@ class Dispatcher:
         ]
         left = dict.fromkeys(lease.servo for job in jobs for lease in job)
         commits: list[asyncio.Task[WorkResult | None]] = []
-        pace = self._estimate_pace if leases[0].estimate else self._pace
         # Of several servos the last one would wait for the estimates of all before it.
-        now, urgency = self._clocks.wall(), (pace.seconds, self._speed, others_wait, others_wait or len(leases) > 1)
+        defer = others_wait or len(leases) > 1
         renewal = asyncio.create_task(self._renew(left))
         try:
             for job in filter(None, jobs):
-                waiting = iter(job)
+                waiting, now = iter(job), self._clocks.wall()
+                expected = [self._updates.expected(lease.servo) for lease in job]
+                urgency = [(seconds, self._speed, others_wait, defer) for seconds in expected]
                 async for done in worker.work(job, now, urgency):
                     lease = next(waiting)
                     del left[lease.servo]
@@ -296,7 +297,8 @@ class Dispatcher:
         self._metrics.work.observe(done.seconds)
         # What has no windows takes a moment: after a quiet hour every servo would seem to.
         if any(message.kind is MessageKind.WINDOW for message in lease.messages):
-            (self._estimate_pace if lease.estimate else self._pace).note(done.seconds)
+            if not lease.estimate:
+                self._pace.note(done.seconds)
             self._estimates.note(done.seconds, lease.estimate)
         if done.result is None:
             self._fail(lease, done.error)
@@ -304,6 +306,7 @@ class Dispatcher:
         if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
+        self._updates.note(lease, done.result, done.seconds)
         if done.result.deferred:
             self._deferred.add(lease.servo)
         elif lease.estimate:
@@ -358,15 +361,8 @@ class Dispatcher:
         for message in lease.messages:
             if message.id != result.deferred:
                 self._metrics.age.observe(max(0.0, now - message.received))
-        for kind, number in Counter(map(log_kind, result.evidence)).items():
-            self._metrics.evidence.add(kind, by=number)
-        about = {"servo": lease.servo, "serial": lease.serial, "seconds": round(seconds, 6)}
-        sources = {message.id: message for message in lease.messages}
-        for record in result.evidence:
-            kind = log_kind(record)
-            level = logging.WARNING if kind in ALARMS else logging.DEBUG if kind in QUIET else logging.INFO
-            if log.isEnabledFor(level):
-                log.log(level, kind, extra={**about, **_identifiers(record, sources.get(record.message))})
+        count_evidence(self._metrics, result)
+        write_evidence(log, lease, result, seconds)
 
 
 _Queue = tuple[str, str]
@@ -379,21 +375,3 @@ def _queue(lease: Lease) -> _Queue:
     if any(message.kind is MessageKind.VERIFICATION for message in lease.messages):
         return lease.servo, _VERIFICATION
     return lease.servo, _ESTIMATE if lease.estimate else _NEW
-
-
-def log_kind(record: EvidenceRecord) -> str:
-    """Kind of evidence in logs and metrics: "failed" for any message that could not be processed."""
-    return "failed" if record.status.startswith("failed") else record.kind
-
-
-def _identifiers(record: EvidenceRecord, source: StoredMessage | None) -> dict[str, object]:
-    """Message, with its receipt, window, version and context of evidence, as far as it has them."""
-    known = {
-        "message_id": record.message,
-        "received": source and utc(source.received),  # under load long before this line
-        "window": source.key if source is not None and source.kind is MessageKind.WINDOW else None,
-        "version": record.version,
-        "status": record.status,
-        "context": record.context,
-    }
-    return {key: value for key, value in known.items() if value not in (None, "")}

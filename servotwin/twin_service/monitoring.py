@@ -16,7 +16,7 @@ from typing import Any, TextIO
 
 import msgspec
 
-from servotwin.messages import Refusal
+from servotwin.messages import Reason, Refusal
 from servotwin.runtime.prometheus import Sample, metric_lines, number_text
 
 _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -183,6 +183,12 @@ class Metrics:
         self.evidence = Counter(
             "servotwin_evidence_total", "Pieces of evidence committed, by kind.", "kind", known=_WATCHED
         )
+        self.receipts = Counter(
+            "servotwin_receipts_total", "Decisions of edges about updates, by reason.", "reason", known=list(Reason)
+        )
+        self.late = Counter(
+            "servotwin_windows_late_total", "Windows without an update, because it would have come too late."
+        )
         self.sent = Counter("servotwin_posted_total", "Messages posted to edges.")
         self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that were replaced.")
         self.missing = Counter(
@@ -192,8 +198,8 @@ class Metrics:
             "servotwin_webhook_total", "Alarms that were posted, by outcome.", "outcome", known=_POSTED
         )
         self._all: list[Counter | Gauge | Histogram] = [
-            self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.sent,
-            self.workers_lost, self.missing, self.webhook,
+            self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.receipts,
+            self.late, self.sent, self.workers_lost, self.missing, self.webhook,
         ]  # fmt: skip
 
     def add_gauge(

@@ -48,6 +48,7 @@ from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.tls_expiry import CertificateExpiry
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.unauthenticated import UnauthenticatedLimit
+from servotwin.twin_service.update_pace import UpdatePace
 from servotwin.twin_service.webhook import WebhookConfig
 from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 from servotwin.twin_service.wrong_tokens import WrongTokens
@@ -117,7 +118,7 @@ class TwinService:
         self.webhook: AlarmWebhook | None = None
         if config.webhook is not None:
             self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
-        self.dispatcher = self._make_dispatcher()
+        self.dispatcher = self._make_dispatcher(twin.servos.model_of)
         away, damage, cut = lambda: self.dispatcher.away, lambda: self.watch.fault, store.engines.opened.cut
         self._store_health = StoreHealth(self.executor, self._writes, away, damage, cut, self.clocks.monotonic)
         self.claims = self._make_claims()
@@ -152,7 +153,7 @@ class TwinService:
             pace=None if config.lockstep else self._pace,
         )
 
-    def _make_dispatcher(self) -> Dispatcher:
+    def _make_dispatcher(self, model_of: Callable[[str], str | None]) -> Dispatcher:
         config = self.config
         return Dispatcher(
             store=self.store,
@@ -165,6 +166,7 @@ class TwinService:
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
             pace=self._work_pace,
+            updates=UpdatePace(model_of, self.clocks),
             speed=min(1.0, config.speed),
             paused=lambda: bool(self.watch.fault),
         )
@@ -202,8 +204,7 @@ class TwinService:
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
-        own_names = self.tokens is None
-        return HttpApp(routes, self._refusals, self._lifespan, own_names=own_names)
+        return HttpApp(routes, self._refusals, self._lifespan, own_names=self.tokens is None)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""

@@ -68,13 +68,13 @@ class WorkerJob(NamedTuple):
     leases : tuple of Lease
     now : float
         s: since the epoch, or sample time in lock-step.
-    urgency : (float, float, bool, bool), optional
-        Fields of `twin.work.Urgency`; the time then runs on from `now`. None: in lock-step.
+    urgency : tuple of (float, float, bool, bool)
+        Of each lease, the fields of `twin.work.Urgency`; the time then runs on from `now`. Empty: in lock-step.
     """
 
     leases: tuple[Lease, ...]
     now: float
-    urgency: WorkerUrgency | None = None
+    urgency: tuple[WorkerUrgency, ...] = ()
 
 
 class LeaseResult(NamedTuple):
@@ -188,10 +188,10 @@ class WorkerProcess:
                 raise WorkerLost(refusal.decode())
 
     async def work(
-        self, leases: Sequence[Lease], now: float, urgency: WorkerUrgency | None = None
+        self, leases: Sequence[Lease], now: float, urgency: Sequence[WorkerUrgency] = ()
     ) -> AsyncIterator[LeaseResult]:
         """Process leases, as `WorkerJob` has them; yields their results in order. Raises WorkerLost."""
-        self._send(encode_frame(WorkerJob(tuple(leases), now, urgency)))
+        self._send(encode_frame(WorkerJob(tuple(leases), now, tuple(urgency))))
         # One timeout per lease, not per job: a job may hold sixteen of them.
         for _ in leases:
             yield decode_result(await self._receive(self._timeout))
@@ -272,11 +272,12 @@ def main(descriptor: int) -> None:
         line.sendall(frame(b""))
         while (body := read_frame(stream)) is not None:
             job, begun = _decode_job(body), time.monotonic()
-            for lease in job.leases:
+            for number, lease in enumerate(job.leases):
+                urgency = job.urgency[number] if job.urgency else None
                 # The leases before this one took their time; in lock-step no time passes.
-                now = job.now if job.urgency is None else job.now + time.monotonic() - begun
+                now = job.now if urgency is None else job.now + time.monotonic() - begun
                 # Each result at once: a lease that kills the worker must not take the results before it along.
-                line.sendall(encode_frame(_attempt(work, lease, now, job.urgency)))
+                line.sendall(encode_frame(_attempt(work, lease, now, urgency)))
 
 
 def _attempt(work: Work, lease: Lease, now: float, urgency: WorkerUrgency | None) -> LeaseResult:

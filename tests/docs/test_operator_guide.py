@@ -29,7 +29,7 @@ from servotwin.link import outbox, sqlite_outbox
 from servotwin.messages import Cause, Reason, Refusal, RequestOutcome
 from servotwin.store.records import Backlog
 from servotwin.store.store import open_store
-from servotwin.twin_service.dispatcher import ALARMS
+from servotwin.twin_service.evidence_lines import ALARMS
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker_pool import WorkerPool

@@ -4,17 +4,20 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Sequence
 
+from servotwin.messages import Setting, Update, encode
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin_service import dispatcher as dispatching
 from servotwin.twin_service.dispatcher import Dispatcher
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
-from servotwin.twin_service.worker import LeaseResult, WorkerLost
+from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerUrgency
 
-DIES, FAILS, TAKES_LONG, DEFERS = b"dies", b"fails", b"takes long", b"defers"
+DIES, FAILS, TAKES_LONG, DEFERS, UPDATES = b"dies", b"fails", b"takes long", b"defers", b"updates"
+TIMES = {TAKES_LONG: 19.0, UPDATES: 7.0}
+UPDATE = encode(Update("a", 1, 0, ("b0", 0), 20.0, 0.1, 0.01, (0.08, 0.12), "OK", Setting(1e-4), 60.0))
 
 
 def claim(servo: str, body: bytes = b"", kind: MessageKind = MessageKind.WINDOW) -> Lease:
@@ -31,6 +34,7 @@ class Lender:
         self.released: list[frozenset[str]] = []
         self.renewed: list[frozenset[str]] = []
         self.held: list[str] = []
+        self.expected: list[float] = []
         self.through = asyncio.Event()
 
     def lease(self, _owner, _limit, _lease, _now, kinds, *, estimate_first, **_more) -> list[Lease]:
@@ -59,7 +63,10 @@ class Lender:
     async def replace(self, _worker, _why) -> None:
         pass
 
-    async def work(self, claims: Sequence[Lease], _now: float, _urgency: object = None) -> AsyncIterator[LeaseResult]:
+    async def work(
+        self, claims: Sequence[Lease], _now: float, urgency: Sequence[WorkerUrgency] = ()
+    ) -> AsyncIterator[LeaseResult]:
+        self.expected += [expected for expected, *_ in urgency]
         for each in claims:
             self.seen.append((each.servo, each.attempts))
             body = each.messages[0].body
@@ -67,9 +74,11 @@ class Lender:
                 raise WorkerLost("it died")
             deferred = 1 if body == DEFERS else 0
             made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,), deferred=deferred)
+            if body == UPDATES and made is not None:
+                made = made._replace(evidence=(EvidenceRecord("redesign", 1, b""),), outgoing=(UPDATE,))
             while body == TAKES_LONG and not self.renewed:
                 await asyncio.sleep(0.001)
-            yield LeaseResult(made, "it failed", 19.0 if body == TAKES_LONG else 0.0)
+            yield LeaseResult(made, "it failed", TIMES.get(body, 0.0))
 
 
 def through(turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace | None = None) -> Lender:
@@ -162,6 +171,14 @@ def test_a_letter_that_takes_no_time_tells_nothing_of_windows(monkeypatch):
     pace = WorkPace()
     through([[claim("a", TAKES_LONG)], *([claim("b", kind=MessageKind.LETTER)] for _ in range(20))], pace=pace)
     assert pace.seconds == 19.0
+
+
+def test_turns_that_take_a_moment_do_not_shorten_what_an_update_is_expected_to_take():
+    """Otherwise each of them lowers the expectation, until the next update is begun and expires."""
+    lender = through(
+        [[claim("a", UPDATES)], [claim("b", UPDATES)], *([claim("b")] for _ in range(20)), [claim("c", UPDATES)]]
+    )
+    assert lender.expected == [0.0, 0.0, *[7.0] * 21]
 
 
 def test_jobs_are_as_large_as_the_work_is_quick():
