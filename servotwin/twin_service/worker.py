@@ -15,7 +15,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -271,13 +271,23 @@ def main(descriptor: int) -> None:
         # Empty: the imports are done, and the worker is ready for a job.
         line.sendall(frame(b""))
         while (body := read_frame(stream)) is not None:
-            job, begun = _decode_job(body), time.monotonic()
-            for number, lease in enumerate(job.leases):
-                urgency = job.urgency[number] if job.urgency else None
-                # The leases before this one took their time; in lock-step no time passes.
-                now = job.now if urgency is None else job.now + time.monotonic() - begun
-                # Each result at once: a lease that kills the worker must not take the results before it along.
-                line.sendall(encode_frame(_attempt(work, lease, now, urgency)))
+            # Each result at once: a lease that kills the worker must not take the results before it along.
+            for result in _results(work, _decode_job(body)):
+                line.sendall(encode_frame(result))
+
+
+def _results(work: Work, job: WorkerJob) -> Iterator[LeaseResult]:
+    """Process the leases of a job in order."""
+    begun, longest = time.monotonic(), 0.0
+    for number, lease in enumerate(job.leases):
+        now, urgency = job.now, None
+        if job.urgency:  # otherwise, in lock-step, no time passes
+            # The leases before this one took their time, and showed what the work takes now.
+            now += time.monotonic() - begun
+            urgency = (max(job.urgency[number][0], longest), *job.urgency[number][1:])
+        result = _attempt(work, lease, now, urgency)
+        longest = max(longest, result.seconds)
+        yield result
 
 
 def _attempt(work: Work, lease: Lease, now: float, urgency: WorkerUrgency | None) -> LeaseResult:

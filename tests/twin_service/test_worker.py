@@ -2,6 +2,7 @@
 
 import asyncio
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -11,11 +12,11 @@ from service_system import twin_file, window
 
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.records import Lease, MessageKind, StoredMessage
+from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.store.store import open_store
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerLost
+from servotwin.twin_service.worker import WorkerJob, WorkerLost, _results
 from servotwin.twin_service.worker_pool import WorkerPool
 
 SCRIPTED = Path(__file__).parents[1] / "support" / "scripted_worker.py"
@@ -93,6 +94,27 @@ def test_a_message_that_needs_more_memory_than_a_worker_may_have_fails_alone(tmp
             await pool.stop()
 
     asyncio.run(body())
+
+
+def test_a_later_lease_of_a_job_begins_later_and_is_expected_to_take_as_long_as_one_before_it():
+    seen = []
+
+    def work(lease, now, urgency):
+        seen.append((lease.servo, now, urgency))
+        time.sleep(0.05 if lease.servo == "ax-1" else 0.0)
+        return WorkResult(lease.servo, 0, b"", None, ())
+
+    leases = tuple(lease(number, "work") for number in range(3))
+    job = WorkerJob(leases, 1e3, ((0.0, 1.0, True, False), (0.02, 1.0, True, False), (0.03, 0.5, False, True)))
+    assert len(list(_results(work, job))) == 3
+    (first, second, third) = (urgency for _, _, urgency in seen)
+    assert (first, second) == job.urgency[:2]
+    assert third[0] >= 0.05
+    assert third[1:] == job.urgency[2][1:]
+    assert seen[2][1] - seen[0][1] >= 0.05
+    seen.clear()
+    assert len(list(_results(work, job._replace(urgency=())))) == 3
+    assert {(now, urgency) for _, now, urgency in seen} == {(1e3, None)}
 
 
 def lease(number, reason):
