@@ -303,10 +303,11 @@ class Dispatcher:
         if done.result is None:
             self._fail(lease, done.error)
             return None
+        self._updates.note_work(done.result, done.seconds)
         if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
-        self._updates.note(lease, done.result, done.seconds)
+        self._updates.note_ways(lease, done.result)
         if done.result.deferred:
             self._deferred.add(lease.servo)
         elif lease.estimate:

@@ -90,20 +90,21 @@ class UpdatePace:
         model, now = self._model_of(servo), self._clocks.monotonic()
         return sum(times[model].expected(now) for times in (self._work, self._way) if model in times)
 
-    def note(self, lease: Lease, result: WorkResult, seconds: float) -> None:
-        """Note a result that was just committed, whose work took so long."""
-        self._note_ways(lease, result)
+    def note_work(self, result: WorkResult, seconds: float) -> None:
+        """Note a result whose work took so long, before it is committed: the next work may begin meanwhile."""
         if (update := _update_of(result)) is None:
             return
-        model, validity = self._model_of(lease.servo), update.not_after - update.data_time
-        self._sent[lease.servo] = _Sent(update.version, self._clocks.wall(), validity)
+        model, validity = self._model_of(result.servo), update.not_after - update.data_time
         if model in self._work:
             self._work[model].note(seconds, self._clocks.monotonic(), validity)
         else:  # the first one may have compiled for a minute
             self._work[model] = RecentTimes(_high)
 
-    def _note_ways(self, lease: Lease, result: WorkResult) -> None:
-        """Note the time from an update to its receipt: as long as a window takes to the twin and an update back."""
+    def note_ways(self, lease: Lease, result: WorkResult) -> None:
+        """Note with a result that was just committed the times from updates to their receipts, and when it sent one.
+
+        A window takes as long to the twin, and an update back.
+        """
         received = {message.id: message.received for message in lease.messages}
         for row in result.evidence:
             sent = self._sent.get(lease.servo)
@@ -114,6 +115,9 @@ class UpdatePace:
             if way <= sent.validity:  # otherwise the edge was away, which tells nothing of the others
                 times = self._way.setdefault(self._model_of(lease.servo), RecentTimes(_middle))
                 times.note(way, self._clocks.monotonic(), sent.validity)
+        if (update := _update_of(result)) is not None:
+            validity = update.not_after - update.data_time
+            self._sent[lease.servo] = _Sent(update.version, self._clocks.wall(), validity)
 
 
 def _high(times: Sequence[float]) -> float:

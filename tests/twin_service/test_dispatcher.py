@@ -35,6 +35,7 @@ class Lender:
         self.renewed: list[frozenset[str]] = []
         self.held: list[str] = []
         self.expected: list[float] = []
+        self.free = True
         self.through = asyncio.Event()
 
     def lease(self, _owner, _limit, _lease, _now, kinds, *, estimate_first, **_more) -> list[Lease]:
@@ -51,6 +52,7 @@ class Lender:
 
     def release(self, _owner, servos=None) -> None:
         """Of the store: the servos; of the pool: a worker."""
+        self.free = True
         if servos is not None:
             self.released.append(servos)
 
@@ -81,10 +83,13 @@ class Lender:
             yield LeaseResult(made, "it failed", TIMES.get(body, 0.0))
 
 
-def through(turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace | None = None) -> Lender:
-    """All turns, one after the other."""
+def through(
+    turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace | None = None, slow_commits: bool = False
+) -> Lender:
+    """All turns, one after the other; where `slow_commits`, with each job before the commit of the one before it."""
 
     async def commit(_outcome: WorkResult) -> bool:
+        await asyncio.sleep(0.2 if slow_commits else 0.0)
         return valid
 
     async def body() -> Lender:
@@ -103,8 +108,9 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace
         )
 
         async def one_by_one() -> "Lender":
-            while dispatcher._tasks:
-                await asyncio.wait(dispatcher._tasks)
+            while dispatcher._tasks and not (slow_commits and lender.free):
+                await asyncio.wait(dispatcher._tasks, timeout=0.001 if slow_commits else None)
+            lender.free = False
             return await Lender.acquire(lender)
 
         lender.acquire = one_by_one
@@ -179,6 +185,11 @@ def test_turns_that_take_a_moment_do_not_shorten_what_an_update_is_expected_to_t
         [[claim("a", UPDATES)], [claim("b", UPDATES)], *([claim("b")] for _ in range(20)), [claim("c", UPDATES)]]
     )
     assert lender.expected == [0.0, 0.0, *[7.0] * 21]
+
+
+def test_work_that_begins_before_the_last_is_committed_is_expected_to_take_as_long_as_that():
+    lender = through([[claim(servo, UPDATES)] for servo in "abc"], slow_commits=True)
+    assert lender.expected == [0.0, 0.0, 7.0]
 
 
 def test_jobs_are_as_large_as_the_work_is_quick():

@@ -32,14 +32,18 @@ class Bench:
         row = EvidenceRecord("redesign", 1, b"", status=status)
         lease = Lease(servo, b"", 0, (StoredMessage(1, MessageKind.WINDOW, b"", "", self.now),))
         outgoing = (update,) if sent and not status else ()
-        self.pace.note(lease, WorkResult(servo, 0, b"", None, (1,), (row,), outgoing), seconds)
+        result = WorkResult(servo, 0, b"", None, (1,), (row,), outgoing)
+        self.pace.note_work(result, seconds)
+        self.pace.note_ways(lease, result)
 
     def receipt(self, way, servo="a1", version=None):
         """Process the receipt for the last update, which came after so long and waited for a while."""
         lease = Lease(servo, b"", 0, (StoredMessage(2, MessageKind.LETTER, b"", "", self.now + way),))
         self.now += way + 3.0
         row = EvidenceRecord("receipt", 2, b"", version=version or self.version, status="expired")
-        self.pace.note(lease, WorkResult(servo, 0, b"", None, (2,), (row,)), 0.001)
+        result = WorkResult(servo, 0, b"", None, (2,), (row,))
+        self.pace.note_work(result, 0.001)
+        self.pace.note_ways(lease, result)
 
     @property
     def expected(self):
