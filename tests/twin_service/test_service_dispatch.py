@@ -17,7 +17,7 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import EvidenceRecord, MessageKind, StoredMessage
 from servotwin.store.store import open_store
 from servotwin.twin_service import dispatcher
-from servotwin.twin_service.dispatcher import _identifiers
+from servotwin.twin_service.evidence_lines import _identifiers
 from servotwin.twin_service.pace import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
