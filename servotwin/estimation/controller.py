@@ -79,15 +79,18 @@ class ControllerComparison:
     @property
     def misread(self) -> bool:
         """True where the voltage hardly moves, or moves the other way: then it is not the one that turned the motor."""
-        still, reversed_ = self.swing < _HARDLY * self.expected, self.factors.get("Kp", 0.0) < 0.0
-        return not self.agrees and (still or reversed_)
+        return not self.agrees and (self._still or self.factors.get("Kp", 0.0) < 0.0)
+
+    @property
+    def _still(self) -> bool:
+        return self.swing < _HARDLY * self.expected
 
     @property
     def sentence(self) -> str:
         """Sentence for the operator; empty where the controllers agree."""
         if self.agrees:
             return ""
-        if self.swing < _HARDLY * self.expected:
+        if self._still:
             return (
                 f"the voltage moves by {self.swing:.2g} V rms where the stated controller would move it by "
                 f"{self.expected:.2g} V: is its channel dead, or in another unit?"

@@ -85,7 +85,7 @@ def _within(columns: Array, target: Array, states: Array, farthest: float) -> Ar
 
 
 def _columns(run: Run, states: Array, given: Array, small: float) -> Array:
-    """What each state adds per unit (n, k) to the command `given` from some states."""
+    """Change (n, k) of the command `given` from some states per unit of each of them."""
     return np.stack([(run(states + each) - given) / small for each in small * np.eye(states.size)], axis=1)
 
 

@@ -26,7 +26,7 @@ VECTOR = 16
 # |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 8)**13 / 13! = 2e-18. Fewer parts
 # with more terms, for an event costs less than one more power: most tables are those of runs with few events.
 TERMS = 24
-PART_POWERS = 4  # of 12 terms
+PART_POWERS = 4  # of the flow, from which the 12 terms of a part of a step are made
 SPECTRAL_STEP = 2.0
 # A motion that lasts into the coarse search must turn slowly enough for a cubic over 8 steps: of 100 random pairs of
 # undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.

@@ -90,7 +90,7 @@ def _late(prepared: Regression, lag: float) -> tuple[Array, Array]:
 
 
 def _left(values: Array, others: Array) -> Array:
-    """What columns (p, k) leave of values (k,)."""
+    """Remainder of values (k,) beside columns (p, k)."""
     scale = np.sqrt(np.sum(others**2, axis=1))
     unit = others / np.where(scale > 0.0, scale, 1.0)[:, None]
     return values - np.linalg.lstsq(unit @ unit.T, unit @ values, rcond=1e-12)[0] @ unit
