@@ -92,15 +92,14 @@ class LinkProcess:
             self._session.trouble = up
             self._sender = Sender(self._session, self._transport)
             self._receiver = Receiver(self._transport, servo, self._token, cursor, retry, random.random, trouble=down)
-        self._outbox_changed, self._stopping = Event(), Event()
+        self._outbox_changed, self._twin_reached, self._stopping = Event(), Event(), Event()
         self._live = _live_view(config, run, samples, self._transport, self._stopping)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._outgoing: list[bytes] = []
         self._broken: list[BaseException] = []
         self._control: frames.StatusFrame | None = None
-        self._pending = (-1, Counter[str]())
-        self._faults: Counter[str] = Counter()
+        self._pending, self._faults = (-1, Counter[str]()), Counter[str]()
         # Counts of earlier processes are in their logs; what a corrupt file has just cost is in none.
         self._troubles = TroubleLog({"to the twin": up, "from the twin": down})
         self._dropped = {} if self.outbox.salvages or self.outbox.missing else self._dropped_unintended()
@@ -237,7 +236,7 @@ class LinkProcess:
             self._pipe.post(frames.encode(frames.PendingFrame(now[0], dict(now[1]))))
 
     def _send(self) -> None:
-        assert self._sender is not None
+        assert self._sender is not None and self._transport is not None
         while not self._stopping.is_set():
             # Before the step: a message that comes meanwhile ends the wait after it.
             self._outbox_changed.clear()
@@ -247,6 +246,8 @@ class LinkProcess:
                 self._emit(frames.encode(frames.MessageFrame(0, encode(acknowledge))))
             if sent.reconnected:
                 self._emit(frames.encode(frames.ReconnectedFrame()))
+                self._twin_reached.set()
+                self._transport.listen_anew()
             if sent.wait_s > 0.0:
                 # An event cannot be waited for infinitely long in seconds.
                 self._outbox_changed.wait(min(sent.wait_s, 3600.0))
@@ -261,7 +262,8 @@ class LinkProcess:
             for serial, body in received.messages:
                 self._resend(body)
                 self._emit(frames.encode(frames.MessageFrame(serial, body)))
-            self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, _SHORTEST_POLL_S))
+            self._twin_reached.wait(received.wait_s if received.messages else max(received.wait_s, _SHORTEST_POLL_S))
+            self._twin_reached.clear()
 
     def _resend(self, body: bytes) -> None:
         """Send acknowledged windows again where the twin asks for them; the agent introduces itself again."""
@@ -282,6 +284,7 @@ class LinkProcess:
     def _end_all(self, threads: list[Thread]) -> None:
         self._stopping.set()
         self._outbox_changed.set()
+        self._twin_reached.set()
         if self._transport is not None:
             # First the blocking calls, so that the threads end; then the file, which they use.
             self._transport.close()

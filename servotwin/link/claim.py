@@ -156,6 +156,10 @@ class ExclusiveTransport:
             self._failed(error)
             raise
 
+    def listen_anew(self) -> None:
+        """End a `listen` under way; see `Transport`."""
+        self._transport.listen_anew()
+
     @property
     def claim(self) -> HeldClaim:
         """The claim that requests name; without number: the servo is not claimed, or the twin knows no claims."""

@@ -159,6 +159,10 @@ class HttpTransport:
         self._twin_marks = status.protocol >= _MARKS
         return status
 
+    def listen_anew(self) -> None:
+        """End a poll whose answer may have been lost on the way; see `Transport`."""
+        self._down.interrupt()
+
     def close(self) -> None:
         """Close both connections."""
         self._up.close()

@@ -48,6 +48,10 @@ class _PlainConnection(HTTPConnection):
     def end(self) -> None:
         """Wake the thread that connects, or waits for a response: its call fails."""
         self.ended = True
+        self.shut_down()
+
+    def shut_down(self) -> None:
+        """Wake the thread that waits for a response: its call fails."""
         with suppress(OSError):
             if self.sock is not None:
                 self.sock.shutdown(socket.SHUT_RDWR)
@@ -154,6 +158,12 @@ class PersistentConnection:
             with self._busy:
                 self.drop()
             raise
+
+    def interrupt(self) -> None:
+        """Send the request that waits for a response, if one does, once more on a fresh connection, or have it fail."""
+        connection = self._connection
+        if connection is not None:
+            connection.shut_down()
 
     def close(self) -> None:
         """Allow no more requests; the one under way fails at once."""

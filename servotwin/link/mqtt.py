@@ -139,6 +139,9 @@ class MqttTransport:
             raise Refused(Refusal.UNKNOWN_SCHEMA, "the twin is of a version without the live view over a broker")
         return response.watched
 
+    def listen_anew(self) -> None:
+        """Do nothing: every request is sent again until it is answered; see `Transport`."""
+
     def close(self) -> None:
         """Close the connection; requests under way raise `Unreachable`."""
         self._closed = True

@@ -90,5 +90,8 @@ class Transport(Protocol):
         Unreachable
         """
 
+    def listen_anew(self) -> None:
+        """End a `listen` under way that may wait for nothing: it began before the twin was out of reach for a time."""
+
     def close(self) -> None:
         """Close the connections at once; `deliver` and `listen` under way raise `Unreachable`."""

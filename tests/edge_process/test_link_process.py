@@ -9,7 +9,7 @@ from threading import Event, Thread
 
 import pytest
 from edge_process_parts import EDGE, SETTINGS, LinkEnd, cut, exchange_all
-from faketwin import FakeTwin
+from faketwin import FakeTwin, Handler
 from waiting import PATIENCE, until
 
 from servotwin.edge.agent import Agent
@@ -23,6 +23,7 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.messages import Cause, ClaimStatus, Fallback, Resend, Setting
 from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
+from servotwin.runtime.retry import Retry
 
 
 def send(pipe: FrameSocket, sequence: int) -> None:
@@ -69,6 +70,36 @@ def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_pro
     assert status["windows"] == {"waiting": 1, "stored": 2, "letters_waiting": 0, "dropped": {}}
     assert list(twin.windows) == [("b1-aa", 0)]
     assert "another edge of this servo" in capfd.readouterr().err
+
+
+def test_once_a_window_has_come_through_again_the_edge_asks_for_messages_at_once(tmp_path: Path, twin: FakeTwin) -> None:
+    """Each way has its pauses after an outage: updates came half a minute after the windows, most of them expired."""
+    (tmp_path / "edge.toml").write_text(EDGE.format(url=twin.url))
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    ours, theirs = socket.socketpair()
+    process, pipe, away = LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa"), FrameSocket(ours), Event()
+    receiver = process._receiver
+    assert receiver is not None
+    receiver._backoff.retry = Retry(3600.0, 1.0, 3600.0)
+
+    def fail(handler: Handler, _body: bytes) -> bool:
+        handler.close_connection = away.is_set()
+        return away.is_set()
+
+    away.set()
+    twin.fault = fail
+    running = Thread(target=process.run)
+    running.start()
+    try:
+        send(pipe, 0)
+        until(lambda: receiver.trouble and process._session.trouble)
+        twin.say(Resend("ax-1", "b1-bb"))
+        away.clear()
+        until(lambda: receiver.after == 1)
+    finally:
+        pipe.close()
+        running.join(PATIENCE)
 
 
 def test_the_control_process_is_told_once_by_a_frame() -> None:

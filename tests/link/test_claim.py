@@ -57,6 +57,9 @@ class Line:
         self.twin.admit(self.claim)
         return []
 
+    def listen_anew(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

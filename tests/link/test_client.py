@@ -57,6 +57,9 @@ class Script:
         self._fail()
         return self.news
 
+    def listen_anew(self) -> None:
+        """Nothing is under way."""
+
     def close(self) -> None:
         """Nothing is open."""
 
