@@ -270,6 +270,8 @@ class Dispatcher:
             self._pool.release(worker)
         finally:
             renewal.cancel()
+            if _queue(leases[0])[1] == _VERIFICATION:
+                self._quota.ended()
         await asyncio.gather(*commits)
 
     async def _renew(self, left: Collection[str]) -> None:

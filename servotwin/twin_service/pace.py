@@ -17,29 +17,38 @@ _MOST_OWED_S = 1.0
 
 
 class VerificationQuota:
-    """Token bucket for verifications, two at most.
+    """Token bucket for verifications, two at most, and of these not as many at once as there are workers.
+
+    Each takes a worker for a second, for which new messages would wait if no worker were left for them.
 
     Parameters
     ----------
     per_minute : float
         0: none is started.
+    workers : int
+        One alone does verifications all the same.
     """
 
     MAX = 2.0
 
-    def __init__(self, per_minute: float) -> None:
-        self._rate = per_minute / 60.0
-        self._level, self._at = (self.MAX if per_minute else 0.0), 0.0
+    def __init__(self, per_minute: float, workers: int = 1) -> None:
+        self._rate, self._at_once = per_minute / 60.0, max(1, workers - 1)
+        self._level, self._at, self._running = (self.MAX if per_minute else 0.0), 0.0, 0
 
     def refill(self, now: float) -> bool:
         """Refill up to `now` (s, monotonic); returns whether a verification may be started."""
         passed, self._at = (max(0.0, now - self._at) if self._at else 0.0), now
         self._level = min(self.MAX, self._level + self._rate * passed)
-        return self._level >= 1.0
+        return self._level >= 1.0 and self._running < self._at_once
 
     def take(self) -> None:
         """Count a verification that was started."""
         self._level -= 1.0
+        self._running += 1
+
+    def ended(self) -> None:
+        """Count a verification that is over."""
+        self._running -= 1
 
 
 class WorkPace:

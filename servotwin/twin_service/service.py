@@ -164,7 +164,7 @@ class TwinService:
             metrics=self.metrics,
             clocks=self.clocks,
             owner=self._owner,
-            quota=VerificationQuota(config.verifications_per_minute),
+            quota=VerificationQuota(config.verifications_per_minute, config.workers),
             pace=self._work_pace,
             updates=UpdatePace(model_of, self.clocks),
             speed=min(1.0, config.speed),

@@ -39,7 +39,7 @@ class Lender:
         self.through = asyncio.Event()
 
     def lease(self, _owner, _limit, _lease, _now, kinds, *, estimate_first, **_more) -> list[Lease]:
-        if MessageKind.VERIFICATION in kinds:
+        if MessageKind.VERIFICATION in kinds and self.turns[0][0].messages[0].kind is not MessageKind.VERIFICATION:
             return []
         self.leased.append((time.monotonic(), estimate_first))
         return list(self.turns.pop(0)) if self.turns else []
@@ -84,7 +84,11 @@ class Lender:
 
 
 def through(
-    turns: Sequence[Sequence[Lease]], valid: bool = True, pace: WorkPace | None = None, slow_commits: bool = False
+    turns: Sequence[Sequence[Lease]],
+    valid: bool = True,
+    pace: WorkPace | None = None,
+    slow_commits: bool = False,
+    quota: VerificationQuota | None = None,
 ) -> Lender:
     """All turns, one after the other; where `slow_commits`, with each job before the commit of the one before it."""
 
@@ -103,7 +107,7 @@ def through(
             metrics=Metrics(),
             clocks=Clocks(),
             owner="me",
-            quota=VerificationQuota(0.0),
+            quota=quota or VerificationQuota(0.0),
             pace=pace or WorkPace(0.5),
         )
 
@@ -137,6 +141,13 @@ def test_a_verification_that_kills_its_workers_is_counted_although_windows_succe
     verification, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
     lender = through([[verification], [window], [verification], [window], [verification]])
     assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
+
+
+def test_a_verification_that_has_killed_its_worker_is_over():
+    quota = VerificationQuota(6.0, workers=2)
+    lender = through([[claim("a", DIES, MessageKind.VERIFICATION)], [claim("b")]], quota=quota)
+    assert lender.seen == [("a", 1), ("b", 1)]
+    assert quota.refill(1e9)
 
 
 def test_a_job_that_was_not_full_waits_for_more_servos_and_a_full_one_does_not(monkeypatch):

@@ -176,10 +176,23 @@ def test_at_most_two_verifications_start_at_once_and_then_at_their_rate():
         now = 0.01 * tick
         if allowance.refill(now):
             allowance.take()
+            allowance.ended()
             begun.append(now)
     assert begun[:2] == [0.01, 0.02]
     assert len(begun) == 2 + 5
     assert not VerificationQuota(0.0).refill(1e6)
+
+
+@pytest.mark.parametrize(("workers", "at_once"), [(1, 1), (2, 1), (3, 2), (9, 2)])
+def test_a_worker_is_left_for_new_messages_while_others_verify(workers: int, at_once: int):
+    """Both of two workers began with a verification of a second each: every new window waited for that long."""
+    quota, running = VerificationQuota(6.0, workers), 0
+    while quota.refill(0.01):
+        quota.take()
+        running += 1
+    assert running == at_once
+    quota.ended()
+    assert quota.refill(1000.0)
 
 
 def test_the_line_of_a_letter_tells_when_it_came() -> None:
