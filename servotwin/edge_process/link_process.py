@@ -236,7 +236,7 @@ class LinkProcess:
             self._pipe.post(frames.encode(frames.PendingFrame(now[0], dict(now[1]))))
 
     def _send(self) -> None:
-        assert self._sender is not None and self._transport is not None
+        assert self._sender is not None
         while not self._stopping.is_set():
             # Before the step: a message that comes meanwhile ends the wait after it.
             self._outbox_changed.clear()
@@ -247,7 +247,7 @@ class LinkProcess:
             if sent.reconnected:
                 self._emit(frames.encode(frames.ReconnectedFrame()))
                 self._twin_reached.set()
-                self._transport.listen_anew()
+                self._sender.transport.listen_anew()
             if sent.wait_s > 0.0:
                 # An event cannot be waited for infinitely long in seconds.
                 self._outbox_changed.wait(min(sent.wait_s, 3600.0))
