@@ -175,6 +175,20 @@ def test_another_motor_is_an_alarm_and_learnt_anew_when_it_stays() -> None:
     assert (back.surprises, back.alarm) == (0, "")
 
 
+def test_a_motor_that_is_another_in_every_window_is_said_once_until_a_window_fits() -> None:
+    """A motor's angle that comes late looks like that."""
+    ways = [loop(PAPER.replace(k_B=factor * PAPER.k_B), 0.0, 0.0) for factor in (1.0, 1.2, 1.4, 0.8)]
+    state, said = learnt(ways[0][:3]), list[str]()
+    for index, way in enumerate([1, 2, 3, 1, 2, 0, 0, 1]):
+        after = learning().updated(state, ways[way][index % 3], 12.0 + 4.0 * index)
+        assert after is not None
+        state = after
+        said.append(state.alarm)
+    assert [bool(alarm) for alarm in said] == [True, False, True, *[False] * 4, True]
+    assert "learnt anew" in said[2]
+    assert "learnt anew" not in said[7]
+
+
 def test_windows_that_tell_nothing_change_nothing() -> None:
     window, known = turned(PAPER, wiggle(0)), learnt([turned(PAPER, wiggle(1))])
     still = Window(window.position, theta_m=np.zeros(5000), voltage=np.zeros(5000), sample_rate=RATE)

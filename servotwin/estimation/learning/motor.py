@@ -36,6 +36,7 @@ _ABOVE_NOISE = 20.0  # standard deviations of the speed's noise: slower motion w
 _FEWEST = 8  # rows
 _MOST_UNEXPLAINED = 0.1  # of the voltage: with more of it unexplained the window is not of this motor
 _EXACT = 1e-3  # of the voltage: no model is more exact than that
+_CONTRADICTED, _ANEW = 1, 2  # what was said
 _WIDE = 10.0  # times the window's voltage: nothing is known of friction and bias before the first window
 _NEAR_LIMIT = 0.1  # of the drive's limit: the input bias may take a command that is so close to it beyond it
 _SURPRISE = 5.0  # standard deviations, of a window's back EMF and lag from what was learnt
@@ -60,6 +61,8 @@ class LearntMotor(Struct, frozen=True):
         Windows in a row since then that contradict it.
     alarm : str
         Sentence on a motor that is not what was learnt; empty without one.
+    said : int
+        What was said since a window last fitted: 1: that one contradicts it; 2: that it is learnt anew.
     """
 
     mean: tuple[float, ...]
@@ -68,6 +71,7 @@ class LearntMotor(Struct, frozen=True):
     windows: int = 1
     surprises: int = 0
     alarm: str = ""
+    said: int = 0
 
     @property
     def matrix(self) -> Array:
@@ -224,13 +228,17 @@ class MotorLearning:
         return replace(motor, covariance=tuple(covariance.ravel().tolist()), time=max(now, motor.time))
 
     def _contradicted(self, before: LearntMotor, fresh: LearntMotor, window: Window, now: float) -> LearntMotor | None:
-        """Keep what was learnt, with an alarm; some such windows in a row mean another motor."""
-        count = before.surprises + 1
+        """Keep what was learnt, with an alarm; some such windows in a row mean another motor.
+
+        Said once until a window fits: where every window is another, what was learnt anew is soon contradicted too.
+        """
+        count, said = before.surprises + 1, before.said
         alarm = f"the motor is not the one that was learnt: {fresh.words()}, where {before.words()} was learnt"
         if count < self.settings.restart_after:
-            return replace(before, surprises=count, alarm=alarm)
+            return replace(before, surprises=count, alarm="" if said else alarm, said=max(said, _CONTRADICTED))
         anew = self.updated(None, window, now)
-        return anew and replace(anew, alarm=f"{alarm}; it is learnt anew after {count} such windows")
+        alarm = "" if said == _ANEW else f"{alarm}; it is learnt anew after {count} such windows"
+        return anew and replace(anew, alarm=alarm, said=_ANEW)
 
     def _outside(self, before: LearntMotor | None, after: LearntMotor, window: Window) -> str:
         """Sentence on a number that has turned out to be outside of what is stated of it; empty without one."""
