@@ -109,6 +109,8 @@ class LastContact:
         The gap between the contact before, on the other side, and this one; None: there was none.
     lead : float
         rad, motor's way to this side in its window at least: the gap was no narrower.
+    jumps : int
+        Contacts that were not where the one before on the same side was, since contacts last confirmed each other.
     """
 
     side: float
@@ -118,6 +120,7 @@ class LastContact:
     time: float
     between: GapBetween | None = None
     lead: float = 0.0
+    jumps: int = 0
 
 
 @dataclass(frozen=True)

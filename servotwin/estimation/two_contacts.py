@@ -1,11 +1,11 @@
-"""Confirmation of a gap that the contacts of two windows show, one on each side, by the two contacts before."""
+"""Confirmation of a gap that the contacts of two windows show, one on each side, by the contacts before."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
-from servotwin.estimation.estimate import GapBetween
+from servotwin.estimation.estimate import GapBetween, LastContact
 
 AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
 SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
@@ -14,6 +14,30 @@ WITHIN = 0.25  # standard deviations per growth within a window, which its one c
 LEAST_PITCH = (
     0.002  # least standard deviation of the pitch: noise and cyclic errors of the angle bend it beyond its own
 )
+
+
+def renewed(last: LastContact, before: LastContact, ahead: float, std: float, possible: float) -> LastContact:
+    """The last contact with what the one before, on the same side, knew of the gap.
+
+    Half of what a gap grows is on either side. A contact that is elsewhere is no wear: an encoder has slipped, or
+    another machine has the name. The contacts before then confirm nothing.
+
+    Parameters
+    ----------
+    last, before : LastContact
+    ahead, std : float
+        rad, way of the motor from the contact before to this one, outwards, and its standard deviation.
+    possible : float
+        rad, growth of the gap in between.
+    """
+    between = before.between
+    spread = AGREE * (std if between is None else math.hypot(std, between.std))
+    if not -spread <= ahead <= 0.5 * possible + spread:
+        return replace(last, between=None, jumps=before.jumps + 1)
+    if between is not None and ahead > spread:
+        middle = between.time + 0.5 * (last.time - before.time)
+        between = replace(between, gap=between.gap + ahead, std=math.hypot(between.std, std), time=middle)
+    return replace(last, between=between, jumps=before.jumps)
 
 
 def followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:

@@ -67,6 +67,7 @@ from servotwin.twin.state import TwinState, draft_update
 from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
+_BY_TURNS = "the gap falls and rises by turns: a setting follows when it has been one for some windows"
 _OTHER = "the voltage is not that of the stated controller: a setting follows when that of a window is"
 _OVERTAKEN = "a newer window of this servo has come: the setting follows from that"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
@@ -355,6 +356,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
         return roll_back(model, state, evidence, overseen.again)
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
+    if state.wear.by_turns and not stale:
+        return state, Redesign(None, math.nan, _BY_TURNS)
     if state.other_controller >= OTHER_CONTROLLER and not stale:
         return state, Redesign(None, math.nan, _OTHER)
     needs_estimate = model.lookups is None and model.policy.needs_estimate

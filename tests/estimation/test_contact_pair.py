@@ -10,6 +10,7 @@ import pytest
 from servotwin.estimation import whitened
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapBetween, GapEstimate, GapStatus, LastContact, OffsetReading
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened import estimate_carrying
@@ -25,10 +26,15 @@ MODEL = Servo.preset("paper")
 # Half the gain and no integral action: every step ends without overshoot, and pushes the screw one way only.
 OWN = MODEL.controller
 CALM = MODEL.replace(Kp=0.4 * OWN.Kp, Kd=0.4 * OWN.Kd, Ki=0.0)
+LIVELY = MODEL.replace(Kp=0.8 * OWN.Kp, Kd=0.8 * OWN.Kd, Ki=0.0)
 KNOWN = FactorPrior.of_spreads(0.001, 0.01, 0.0005, 0.001)
 SETTINGS = whitened.WhitenedSettings()
 STARTS = (9.7, 19.7, 29.7, 39.7)
 """Of windows about steps back, forth, back and forth, s."""
+JUMPED = (
+    "2 times the motor met the screw elsewhere than before on the same side, by more than wear moves it: an encoder "
+    "slips, or the windows are of two machines; no gap is read from such windows together"
+)
 REFUSED = {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND}
 
 
@@ -49,13 +55,19 @@ def noisy(made: list[Window], noise: float = 1e-7, seed: int = 0) -> list[Window
     return [each.replace(position=each.position + noise * rng.standard_normal(each.position.size)) for each in made]
 
 
-def estimates(made: list[Window], gap_rate: float = 0.0) -> list[GapEstimate]:
+def later(window: Window, time: float) -> Window:
+    """The same window, by `time` (s) later."""
+    channels = {"position": window.position, "theta_m": window.theta_m, "voltage": window.voltage}
+    return Window(**channels, sample_rate=window.sample_rate, start=window.start + time)
+
+
+def estimates(made: list[Window], gap_rate: float = 0.0, servo: Servo = CALM) -> list[GapEstimate]:
     """Estimates one after the other, each with the contact of the one before; `gap_rate`: assumed growth, rad/s."""
     results: list[GapEstimate] = []
     for window in made:
         before = results[-1].contact if results else None
         settings = replace(SETTINGS, gap_rate=gap_rate)
-        results.append(estimate_carrying(window, CALM, None, settings, None, KNOWN, before))
+        results.append(estimate_carrying(window, servo, None, settings, None, KNOWN, before))
     return results
 
 
@@ -162,6 +174,44 @@ def test_a_gap_narrower_than_the_lead_of_the_motor_before_does_not_count():
     made = estimate_carrying(second, CALM, None, SETTINGS, None, KNOWN, before)
     assert not made.ok
     assert "the motor leads the screw by 28 deg" in made.reasons[-1]
+
+
+def told(made: list[GapEstimate]) -> list[str]:
+    """Alarms of a wear that some windows move."""
+    wear, trends, learning, sentences = Wear(0.0), TrendSettings(), LearningSettings(), []
+    for each in made:
+        before = wear
+        wear, _ = before.update(trends, "a", each, each.time)
+        sentences += wear.alarms(before, each, trends, learning)
+    return sentences
+
+
+@pytest.mark.parametrize("wide", [5.6, 12.0])
+def test_two_machines_by_turns_show_no_gap_between_theirs(wide):
+    """Each contact is followed by the other machine's on the same side, half of the difference further out."""
+    chains = []
+    for gap, seed in ((5.0, 7), (wide, 12)):
+        swung = simulate(LIVELY, 30.0, reference=SquareWave(1e-3, 12.0), gap=gap * DEG, sample_rate=1e3)
+        chains.append(noisy([Window.from_run(swung, start, 2.0) for start in (5.7, 11.7, 17.7, 23.7)], 4e-7, seed))
+    narrow = chains[0]
+    others = [later(each, 3.0) for each in chains[1]]
+    assert estimates(narrow, 0.05 * DEG, LIVELY)[-1].ok
+    made = estimates([each for pair in zip(narrow, others, strict=True) for each in pair], 0.05 * DEG, LIVELY)
+    assert not any(each.ok for each in made)
+    assert told(made) == [JUMPED]
+
+
+def test_the_pair_before_grows_with_the_contact_on_its_side():
+    """Between the first contact and the last one, on the other side, is the mean of the gaps at both."""
+    grown = simulate(
+        CALM, 50.0, reference=SquareWave(2.5e-4, 20.0), gap=SCurve(GAP, GAP + 2.0 * DEG, 50.0), sample_rate=1e3
+    )
+    made = estimates(noisy([Window.from_run(grown, start, 2.0) for start in (9.7, 19.7, 39.7)], 1e-8), 0.2 * DEG)
+    first, *_, last = (each.contact for each in made)
+    at_both = [float(grown.gap[round(1e3 * each.time)]) for each in (first, last)]
+    assert last.between.gap == pytest.approx(np.mean(at_both), abs=0.05 * DEG)
+    assert last.between.time == pytest.approx(0.5 * (first.time + last.time), abs=1.0)
+    assert last.jumps == 0
 
 
 @pytest.mark.parametrize("slip", [-1.0, 1.0])

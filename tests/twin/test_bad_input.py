@@ -122,6 +122,22 @@ def test_windows_of_two_machines_by_turns_give_no_wrong_gap_and_soon_no_setting(
     assert all(redesign.setting is None for redesign in seen.redesigns[3:])
 
 
+def test_a_gap_that_falls_and_rises_by_turns_is_said_and_gets_no_setting():
+    """Two machines of one structure under one name: each window shows its own gap, within what may grow."""
+    made = iter(gaps := [5.0, 5.8] * 4 + [5.8] * 3)
+
+    def estimate(window, _expected):
+        gap, std, middle = math.radians(next(made)), math.radians(0.02), window.start + 0.5 * window.duration
+        return GapEstimate(gap, std, std, (gap - 2.0 * std, gap + 2.0 * std), GapStatus.OK, middle)
+
+    model = TwinModel.of(MODEL, TwinSettings(policy="margin"), estimator=estimate)
+    seen = Seen([window_message(number, 10.0 * number) for number in range(len(gaps))], model)
+    assert [place for place, alarm in enumerate(seen.alarms) if alarm] == [2, 4]
+    assert "falls and rises by turns, now from 5.8 to 5 deg" in seen.alarms[4]
+    assert [redesign.setting is not None for redesign in seen.redesigns] == [True] * 4 + [False] * 6 + [True]
+    assert "falls and rises by turns" in seen.redesigns[5].reason
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "said"),

@@ -277,3 +277,42 @@ def test_sixteen_bits_for_the_angle_cost_windows():
     assert np.max(np.abs(errors_deg(coarse))) < 0.05
     names = [channel.name for channel in fine.windows[0].channels]
     assert names == ["reference", "theta_m", "theta_m_fine", "position", "voltage"]
+
+
+def told(*gaps_deg: float, every: float = 60.0) -> list[str]:
+    """What is said of gaps that accepted windows show, one `every` s."""
+    wear, learning, said = Wear(0.0), LearningSettings(), []
+    for number, gap in enumerate(gaps_deg):
+        before, estimate = wear, seen(gap, every * number)
+        wear, _ = wear.update(SETTINGS, "boot-1", estimate, every * number)
+        said.append(" | ".join(wear.alarms(before, estimate, SETTINGS, learning)))
+    return said
+
+
+def test_a_gap_that_falls_is_said_once():
+    """By more than six standard deviations; less is none, growth is wear, and more falls in a row are the same one."""
+    said = told(7.0, 7.4, 7.3, 6.9, 6.5, 6.5, 6.5, 6.5, 6.0, 6.4)
+    assert [place for place, sentence in enumerate(said) if sentence] == [3, 8]
+    assert "the gap has fallen from 7.3 to 6.9 deg, which no wear does" in said[3]
+
+
+@pytest.mark.parametrize("turns", [(5.0, 7.0), (5.0, 5.0, 7.0, 7.0), (5.0, 5.0, 5.0, 7.0, 7.0, 7.0)])
+def test_a_gap_that_falls_and_rises_by_turns_is_said_once(turns):
+    said = told(*turns, *turns, *turns, *turns)
+    assert [place for place, sentence in enumerate(said) if sentence] == [len(turns), 2 * len(turns)]
+    assert "has fallen from 7 to 5 deg" in said[len(turns)]
+    assert "falls and rises by turns, now from 7 to 5 deg" in said[2 * len(turns)]
+
+
+def test_fast_wear_after_a_repair_is_no_other_machine():
+    """The gap grows surely from window to window, and is repaired again."""
+    said = told(10.0, 2.0, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 2.0, 2.0)
+    assert not any("by turns" in sentence for sentence in said)
+    assert "from 4.5 to 2 deg" in said[8]
+
+
+def test_an_outlier_is_no_fall_until_it_counts():
+    """A second one that agrees is said to be a jump."""
+    steady = [10.0] * 8
+    assert told(*steady, 0.5, 10.0, 10.0, 10.0, every=5.0) == [""] * 12
+    assert [bool(sentence) for sentence in told(*steady, 0.5, 0.5, every=5.0)] == [False] * 9 + [True]

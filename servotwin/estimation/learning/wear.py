@@ -1,8 +1,8 @@
 """Knowledge of a servo from its windows, from one to the next: gap and wear, the machine's and the motor's numbers.
 
 `Wear.update` takes one window's estimate, and `Wear.expect` says what is known before the next one. The parts are in
-this package: the trend of the gap (`trend`), the machine's stiffness, damping, pitch and mass ratio (`machine`), and
-the motor's back EMF, lag, friction and input bias (`motor`). Pure.
+this package: the trend of the gap (`trend`), falls that no wear explains (`falls`), the machine's stiffness, damping,
+pitch and mass ratio (`machine`), and the motor's back EMF, lag, friction and input bias (`motor`). Pure.
 """
 
 from __future__ import annotations
@@ -16,12 +16,15 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate, GapStatus, LastContact
+from servotwin.estimation.learning.falls import Falls
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, updated
 from servotwin.estimation.learning.motor import LearntMotor, MotorLearning
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 
+_JUMPS = 2  # contacts that are not where they were: once an encoder may have slipped, or have been homed anew
+_WHY_FALLEN = "after a repair or a new screw it may; else an encoder has slipped, or two machines have this name"
 NOT_LEARNING = LearningSettings(learn=False)
 
 
@@ -144,6 +147,8 @@ class Wear(Struct, frozen=True):
         the last one's commands that were.
     contact, contact_boot : LastContact or None, str
         Last contact of the last window that showed one only, and its boot.
+    falls : Falls or None
+        None before the first accepted estimate.
     """
 
     previous: float
@@ -159,6 +164,17 @@ class Wear(Struct, frozen=True):
     limited: float = 0.0
     contact: LastContact | None = None
     contact_boot: str = ""
+    falls: Falls | None = None
+
+    @property
+    def by_turns(self) -> bool:
+        """True while the gap falls and rises by turns: no setting may rest on it."""
+        return self.falls is not None and self.falls.by_turns
+
+    @property
+    def jumps(self) -> int:
+        """Contacts that were not where the one before on the same side was, since two last confirmed each other."""
+        return 0 if self.contact is None else self.contact.jumps
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
@@ -215,6 +231,12 @@ class Wear(Struct, frozen=True):
             Knowledge after the window, and the reason for which no update may follow from it; empty: it may.
         """
         wear, rejection = self._update_trend(settings, boot, estimate, now)
+        if not rejection:
+            seen = Falls(estimate.gap, estimate.std_total)
+            if self.falls is not None:
+                shared, sure = settings.shared_error_rad, settings.outlier_std
+                seen = self.falls.after(estimate, shared, sure, learning.restart_after)
+            wear = replace(wear, falls=seen)
         wear = self._with_mismatches(wear, estimate, learning.restart_after)
         if (contact := estimate.contact) is not None and self._is_newer(contact, boot):
             wear = replace(wear, contact=contact, contact_boot=boot)
@@ -265,13 +287,36 @@ class Wear(Struct, frozen=True):
                 f"command is at the drive's limit of {motor.limit:g} V in {100.0 * self.limited:.3g} % of the samples; "
                 "check the limit, the load and the steps of the reference"
             )
+        if self.jumps == _JUMPS > before.jumps:
+            sentences.append(
+                f"{_JUMPS} times the motor met the screw elsewhere than before on the same side, by more than wear "
+                "moves it: an encoder slips, or the windows are of two machines; no gap is read from such windows "
+                "together"
+            )
         trend, earlier = self.trend(settings), before.trend(settings)
+        if trend is not None and not trend.afresh:
+            sentences += self._fallen(before)
         if trend is not None and earlier is not None and trend.afresh and not earlier.afresh:
             sentences.append(
                 f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(trend.gap):.3g} deg, as "
                 "after a crash, a repair or a new screw: it is followed from there"
             )
         return sentences
+
+    def _fallen(self, before: Wear) -> list[str]:
+        """Sentence on a gap that has fallen with this window, or once more; empty without one."""
+        now, then = self.falls, before.falls
+        if now is None or then is None:
+            return []
+        ways = f"from {math.degrees(then.gap):.3g} to {math.degrees(now.gap):.3g} deg"
+        if now.by_turns and not then.by_turns:
+            return [
+                f"the gap falls and rises by turns, now {ways}, which no wear does: two machines may have this name, "
+                "or it is another gap in other places; no setting follows until it has been one for some windows"
+            ]
+        if now.fallen > 0.0 == then.fallen:
+            return [f"the gap has fallen {ways}, which no wear does: {_WHY_FALLEN}"]
+        return []
 
     def _with_mismatches(self, wear: Wear, estimate: GapEstimate, enough: int) -> Wear:
         """`wear` with the count of windows that fit no machine; `enough` that fit in a row end that of lapses."""

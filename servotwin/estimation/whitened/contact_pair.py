@@ -32,6 +32,7 @@ from servotwin.estimation.two_contacts import (
     confirmed_gap,
     deg,
     followed,
+    renewed,
     unconfirmed,
 )
 from servotwin.estimation.whitened.doubt import way_doubt
@@ -203,7 +204,7 @@ class Pair:
             return None
         assert self.before.between is not None
         made = _stated(self.here, self.before, self.between, self.before.between)
-        return replace(made, contact=self.contact)
+        return replace(made, contact=replace(self.contact, jumps=0))
 
     def agrees(self, other: GapEstimate) -> bool:
         """True where the contacts do not contradict another estimate of the same window.
@@ -229,31 +230,49 @@ def pair(here: OneContact, before: LastContact | None) -> Pair:
     """Find the gap between a window of one contact and the last contact of an earlier one on the other side.
 
     It belongs to the middle between both contacts, because half of it is that of each. The contacts of a third window
-    must confirm it: the encoder may have slipped in between.
+    must confirm it: the encoder may have slipped in between. So must contacts on the same side, where they come first.
     """
     contact = here.last()
     if before is None or not before.time < here.begin.time:
         return Pair(here, contact)
     if before.side == here.side:
-        return Pair(here, replace(contact, between=before.between))
+        ahead, spread = _ahead(here, contact, before)
+        grown = NORMAL_95 * here.fitted.settings.gap_rate * (contact.time - before.time)
+        return Pair(here, renewed(contact, before, ahead, spread, grown))
     moved = (here.begin.position - before.position) / here.gain
     gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
     between = followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
     # What is known so badly confirms no other gap.
     vague = std > VAGUE * here.fitted.settings.of_gap(gap).largest_std
-    return Pair(here, replace(contact, between=before.between if vague else between), before, between)
+    last = replace(contact, between=before.between if vague else between, jumps=before.jumps)
+    return Pair(here, last, before, between)
+
+
+def _ahead(here: OneContact, contact: LastContact, before: LastContact) -> tuple[float, float]:
+    """Way (rad) of the motor from the contact before to this one, outwards, less the screw's; its standard deviation.
+
+    With the screw where it was at last or at first, whichever is nearer to where it was before.
+    """
+    at_last, at_first = ((touch.position - before.position) / here.gain for touch in (here.end, here.begin))
+    if abs(at_last) <= abs(at_first):
+        std = math.hypot(contact.std, before.std, _pitch_std(here) * at_last)
+        return here.side * (here.end.motor - before.motor - at_last), std
+    return here.side * (here.begin.motor - before.motor - at_first), _spread(here, before, at_first)
 
 
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
-    problem = here.learnt.problem
-    # A softer screw takes more of the travel.
-    pitch = max(
-        LEAST_PITCH, math.sqrt(problem.prior.covariance[PITCH, PITCH]), SCREW_SPREAD * own_softness(problem.servo)
-    )
     way, level = here.way_std, here.begin.std / here.gain
     unsure = max(0.0, here.apart - NORMAL_95 * way)
-    return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)
+    return math.hypot(way + level, unsure, before.std, here.rounded, _pitch_std(here) * moved)
+
+
+def _pitch_std(here: OneContact) -> float:
+    """Relative standard deviation of the pitch; a softer screw takes more of the travel."""
+    problem = here.learnt.problem
+    return max(
+        LEAST_PITCH, math.sqrt(problem.prior.covariance[PITCH, PITCH]), SCREW_SPREAD * own_softness(problem.servo)
+    )
 
 
 def _against(here: OneContact, between: GapBetween, lead: float, possible: float) -> str:
