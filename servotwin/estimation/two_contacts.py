@@ -47,12 +47,17 @@ def followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
     return replace(now, rate=(now.gap - earlier.gap) / (now.time - earlier.time))
 
 
+def fallen(now: GapBetween, earlier: GapBetween) -> bool:
+    """True where a gap is surely narrower than an earlier one."""
+    return now.gap - earlier.gap < -AGREE * math.hypot(now.std, earlier.std)
+
+
 def unconfirmed(now: GapBetween, earlier: GapBetween | None, possible: float) -> str:
     """Reason for which the two contacts before do not confirm a gap that may have grown (rad); empty: they do."""
     if earlier is None:
         return f"two contacts show a gap of {deg(now.gap)}: another window must confirm it"
     spread = AGREE * math.hypot(now.std, earlier.std)
-    if -spread <= now.gap - earlier.gap <= possible + spread:
+    if not fallen(now, earlier) and now.gap - earlier.gap <= possible + spread:
         return ""
     return f"two contacts show a gap of {deg(now.gap)}, the two before {deg(earlier.gap)}"
 

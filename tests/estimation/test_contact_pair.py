@@ -258,6 +258,38 @@ def test_contacts_contradict_a_wrong_offset():
     assert holds(corrected, GAP)
 
 
+def test_a_contact_that_has_jumped_or_a_gap_that_has_fallen_doubts_the_offset():
+    """A new screw in the same boot: with the old offset a window was 0.6 deg off, and its pair took that for wear."""
+    first, second, third, _ = windows(1e-7)
+    contact = estimates([first, second])[1].contact
+    offset = (0.0, 0.001 * DEG)
+
+    def estimated(before: LastContact) -> GapEstimate:
+        return estimate_carrying(third, CALM, None, replace(SETTINGS, gap_rate=0.1 * DEG), offset, KNOWN, before)
+
+    assert isinstance(estimated(contact).offset, CarriedOffset)
+    by_contacts = estimated(replace(contact, jumps=1))
+    assert isinstance(by_contacts.offset, OffsetReading)
+    assert by_contacts.contact.jumps == 0
+    alone = replace(contact, jumps=1, between=None)
+    assert not estimated(alone).ok
+    assert estimated(alone).contact.jumps == 1
+    wider = replace(contact.between, gap=contact.between.gap + 0.5 * DEG)
+    assert not estimated(replace(contact, between=wider)).ok
+
+
+def test_a_window_of_both_sides_ends_the_doubt_of_contacts_that_jumped():
+    wear, settings = Wear(0.0), TrendSettings()
+    second = estimates(windows()[:2])[1]
+    jumped = replace(second, contact=replace(second.contact, jumps=1))
+    after, _ = wear.update(settings, "a", jumped, 0.0)
+    assert after.jumps == 1
+    both = replace(second, status=GapStatus.OK, contact=None, gap=GAP, std=0.01 * DEG, std_total=0.02 * DEG)
+    shown, _ = after.update(settings, "a", both, 0.0)
+    assert (shown.jumps, shown.contact) == (0, None)
+    assert after.update(settings, "a", replace(both, status=GapStatus.LOWER_BOUND), 0.0)[0].jumps == 1
+
+
 def test_wear_keeps_the_newest_contact_of_a_boot():
     wear, settings = Wear(0.0), TrendSettings()
     first, second, *_ = estimates(windows())

@@ -240,6 +240,8 @@ class Wear(Struct, frozen=True):
         wear = self._with_mismatches(wear, estimate, learning.restart_after)
         if (contact := estimate.contact) is not None and self._is_newer(contact, boot):
             wear = replace(wear, contact=contact, contact_boot=boot)
+        elif contact is None and estimate.ok and self.jumps > 0:
+            wear = replace(wear, contact=None)  # the window shows both sides: the encoder's offset is known again
         if motor is not None and window is not None:
             wear = self._with_motor(wear, motor, window, now)
         if not learning.learn:

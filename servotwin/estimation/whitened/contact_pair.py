@@ -31,6 +31,7 @@ from servotwin.estimation.two_contacts import (
     WITHIN,
     confirmed_gap,
     deg,
+    fallen,
     followed,
     renewed,
     unconfirmed,
@@ -209,16 +210,22 @@ class Pair:
     def agrees(self, other: GapEstimate) -> bool:
         """True where the contacts do not contradict another estimate of the same window.
 
-        Where two contacts before have not shown the growth, the one that is assumed counts.
+        Where two contacts before have not shown the growth, the one that is assumed counts. A gap that has fallen, or a
+        contact that has jumped, is no growth: the encoder may have slipped, and its offset be another, until two
+        contacts confirm each other.
         """
         seen, earlier = self.between, None if self.before is None else self.before.between
+        if self.contact.jumps > 0 or (seen is not None and earlier is not None and fallen(seen, earlier)):
+            return False
         if seen is None:
             return True
         elapsed, spread = other.time - seen.time, AGREE * math.hypot(other.std_total, seen.std)
         if math.isnan(seen.rate):
             return abs(other.gap - seen.gap) <= spread + NORMAL_95 * self.here.fitted.settings.gap_rate * elapsed
-        bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(seen.rate - earlier.rate)
-        return abs(other.gap - seen.gap - seen.rate * elapsed) <= spread + bend * elapsed
+        # What shrinks does not go on shrinking.
+        grows = max(0.0, seen.rate)
+        bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(grows - max(0.0, earlier.rate))
+        return abs(other.gap - seen.gap - grows * elapsed) <= spread + bend * elapsed
 
     def added_to(self, alone: GapEstimate) -> GapEstimate:
         """Another estimate of the later window, with the contact and, where it is not OK, the reason."""
