@@ -5,7 +5,8 @@ from __future__ import annotations
 import json as jsons
 import ssl
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -17,6 +18,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 import msgspec
 
 from servotwin.cli.audit_report import JsonObject, Units, lines_of, servo_lines
+from servotwin.cli.check import store_to_read, telling_after
 from servotwin.config.files import read_secret
 from servotwin.config.table import did_you_mean
 from servotwin.dashboard.series import machine_series
@@ -27,11 +29,9 @@ from servotwin.link.url import in_clear, is_encrypted
 from servotwin.runtime import files
 from servotwin.store.records import ServoSummary
 from servotwin.store.store import Store
-from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.fleet_reader import FleetReader
 from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
 from servotwin.twin_service.reports import report_of
-from servotwin.twin_service.twin_file import service_of
 
 _TIMEOUT_S = 30.0
 _BEFORE_S = 60.0
@@ -84,20 +84,21 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     Raises
     ------
     InvalidInput
-        The servo is unknown or has sent no window, or the source cannot be read.
+        The servo is unknown or has sent no window, the source cannot be read, or its store is damaged.
     """
-    if source.url is None:
-        evidence = _read_store(servo, source.config, limit)
-    else:
-        evidence = _read_service(servo, source, limit)
-    if not evidence.traces:
-        raise InvalidInput(f"servo {servo!r}: has sent messages, but no window yet")
-    if json:
-        print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
-        return
-    servo_row, traces, events, machine = evidence
-    for line in lines_of(servo_row, traces, events, Units.of(machine), changes):
-        print(line)
+    with _opened(source) as opened:
+        if isinstance(opened, Store):
+            evidence = _read_store(servo, opened, limit)
+        else:
+            evidence = _read_service(servo, opened, limit)
+        if not evidence.traces:
+            raise InvalidInput(f"servo {servo!r}: has sent messages, but no window yet")
+        if json:
+            print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
+            return
+        servo_row, traces, events, machine = evidence
+        for line in lines_of(servo_row, traces, events, Units.of(machine), changes):
+            print(line)
 
 
 def write_report(servo: str, source: Source, to: Path) -> None:
@@ -106,20 +107,17 @@ def write_report(servo: str, source: Source, to: Path) -> None:
     Raises
     ------
     InvalidInput
-        The servo is unknown, the source cannot be read, or the file not written.
+        The servo is unknown, the source cannot be read, its store is damaged, or the file not written.
     """
-    if source.url is None:
-        store = open_existing_store(service_of(source.config))
-        try:
-            known_servo(store, servo)
-            text = report_of(store, FleetReader(store, lambda _: None, time.time), servo) or ""
-        finally:
-            store.close()
-    else:
-        text = _client(source)(f"/v1/servos/{quote(servo, safe='')}/report.html").decode()
-    with files.atomic_output(to) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    print(f"servotwin audit: wrote {to}")
+    with _opened(source) as opened:
+        if isinstance(opened, Store):
+            known_servo(opened, servo)
+            text = report_of(opened, FleetReader(opened, lambda _: None, time.time), servo) or ""
+        else:
+            text = opened.get(f"/v1/servos/{quote(servo, safe='')}/report.html").decode()
+        with files.atomic_output(to) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        print(f"servotwin audit: wrote {to}")
 
 
 def servos(source: Source, json: bool) -> None:
@@ -128,22 +126,22 @@ def servos(source: Source, json: bool) -> None:
     Raises
     ------
     InvalidInput
-        The source cannot be read.
+        The source cannot be read, or its store is damaged.
     """
-    if source.url is not None:
-        get_json = _json_client(source)
-        rows = _all_pages(lambda after: get_json(f"/v1/servos?limit={MAX_ROWS}&after={quote(after, safe='')}"))
-    else:
-        store = open_existing_store(service_of(source.config))
-        try:
-            rows = _all_pages(lambda after: [each._asdict() for each in store.servos(after)])
-        finally:
-            store.close()
-    if json:
-        print(msgspec.json.format(msgspec.json.encode(rows)).decode())
-        return
-    for line in servo_lines(rows):
-        print(line)
+    with _opened(source) as opened:
+        rows = _all_pages(_servos_of(opened))
+        if json:
+            print(msgspec.json.format(msgspec.json.encode(rows)).decode())
+            return
+        for line in servo_lines(rows):
+            print(line)
+
+
+def _servos_of(opened: Store | _Service) -> Callable[[str], list[JsonObject]]:
+    """Return a function that reads the servos after a name."""
+    if isinstance(opened, Store):
+        return lambda after: [each._asdict() for each in opened.servos(after)]
+    return lambda after: opened.get_json(f"/v1/servos?limit={MAX_ROWS}&after={quote(after, safe='')}")
 
 
 def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
@@ -163,33 +161,30 @@ def known_servo(store: Store, servo: str) -> ServoSummary:
     return summary
 
 
-def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
-    store = open_existing_store(service_of(config))
-    try:
-        summary, traces = known_servo(store, servo), store.audit(servo, limit=limit)
-        if not traces:
-            return _ServoEvidence({}, [], [], {})
-        events = store.events(servo, _since(trace.window.received for trace in traces), MAX_ROWS)
-        series = store.reading(lambda connection: machine_series(connection, servo, 1))
-        return _ServoEvidence(
-            summary._asdict(),
-            [trace_as_json(trace) for trace in traces],
-            [evidence_as_json(each) for each in events],
-            asdict(series["machine"]),
-        )
-    finally:
-        store.close()
+def _read_store(servo: str, store: Store, limit: int) -> _ServoEvidence:
+    summary, traces = known_servo(store, servo), store.audit(servo, limit=limit)
+    if not traces:
+        return _ServoEvidence({}, [], [], {})
+    events = store.events(servo, _since(trace.window.received for trace in traces), MAX_ROWS)
+    series = store.reading(lambda connection: machine_series(connection, servo, 1))
+    return _ServoEvidence(
+        summary._asdict(),
+        [trace_as_json(trace) for trace in traces],
+        [evidence_as_json(each) for each in events],
+        asdict(series["machine"]),
+    )
 
 
-def _read_service(servo: str, source: Source, limit: int) -> _ServoEvidence:
-    get_json, name = _json_client(source), quote(servo, safe="")
-    traces = get_json(f"/v1/servos/{name}/audit?limit={limit}")
-    summary = get_json(f"/v1/servos/{name}")
+def _read_service(servo: str, service: _Service, limit: int) -> _ServoEvidence:
+    name = quote(servo, safe="")
+    traces = service.get_json(f"/v1/servos/{name}/audit?limit={limit}")
+    summary = service.get_json(f"/v1/servos/{name}")
     if not traces:
         return _ServoEvidence({}, [], [], {})
     since = _since(trace["window"]["received"] for trace in traces)
-    events = get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
-    return _ServoEvidence(summary, traces, events, get_json(f"/v1/servos/{name}/gaps?limit=1").get("machine", {}))
+    events = service.get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
+    machine = service.get_json(f"/v1/servos/{name}/gaps?limit=1").get("machine", {})
+    return _ServoEvidence(summary, traces, events, machine)
 
 
 def _since(received: Iterable[float]) -> float:
@@ -198,47 +193,80 @@ def _since(received: Iterable[float]) -> float:
     return max(0.0, min(received) - _BEFORE_S)
 
 
-def _json_client(source: Source) -> Callable[[str], Any]:
-    """Return a function that requests JSON from the service; raises InvalidInput."""
-    get = _client(source)
+def _opened(source: Source) -> AbstractContextManager[Store | _Service]:
+    """Open a source for a block that shows what is in it; after the block it says where the store is damaged."""
+    return store_to_read(source.config) if source.url is None else _service_to_read(source)
 
-    def get_json(path: str) -> Any:
-        text = get(path)
+
+@contextmanager
+def _service_to_read(source: Source) -> Iterator[_Service]:
+    service = _Service(source)
+    with telling_after(service.require_sound):
+        yield service
+
+
+class _Service:
+    """A twin's service; its methods raise InvalidInput."""
+
+    def __init__(self, source: Source) -> None:
+        self._url, self._ca, self._headers = str(source.url).rstrip("/"), source.ca, dict[str, str]()
+        self._answers = False
+        if not _is_address(self._url):
+            raise InvalidInput(f"url {self._url!r}: give the URL of a twin, such as https://twin:8765")
+        if source.token is not None and in_clear(self._url):
+            raise InvalidInput(f"url {self._url!r}: would send the token in clear to another machine; give https://")
+        if source.token is not None:
+            token = read_secret(source.token, in_header=True, longest=MAX_TOKEN)
+            self._headers["Authorization"] = f"Bearer {token}"
+        # A request in clear goes to this computer only, and must not pass a proxy, which could read the token.
+        encrypted = is_encrypted(self._url)
+        self._opener = build_opener(
+            _NoRedirect, HTTPSHandler(context=_context(self._ca)) if encrypted else ProxyHandler({})
+        )
+
+    def get(self, path: str) -> bytes:
+        """Request a path."""
         try:
-            return jsons.loads(text)
-        except ValueError as error:
-            raise InvalidInput(f"{source.url}: its answer is not JSON ({error}): is that a twin?") from None
-
-    return get_json
-
-
-def _client(source: Source) -> Callable[[str], bytes]:
-    """Return a function that requests from the service; raises InvalidInput."""
-    url, headers = str(source.url).rstrip("/"), {}
-    if not _is_address(url):
-        raise InvalidInput(f"url {url!r}: give the URL of a twin, such as https://twin:8765")
-    if source.token is not None and in_clear(url):
-        raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
-    if source.token is not None:
-        headers["Authorization"] = f"Bearer {read_secret(source.token, in_header=True, longest=MAX_TOKEN)}"
-    # A request in clear goes to this computer only, and must not pass a proxy, which could read the token.
-    handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
-    opener = build_opener(_NoRedirect, handler)
-
-    def get(path: str) -> bytes:
-        try:
-            with opener.open(Request(url + path, headers=headers), timeout=_TIMEOUT_S) as response:
-                body: bytes = response.read()
+            with self._open(path) as response:
+                self._answers, body = True, bytes(response.read())
                 return body
         except HTTPError as error:
-            raise InvalidInput(f"{url}: {_refusal(error)}") from None
+            self._answers = True
+            raise InvalidInput(f"{self._url}: {_refusal(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
             # urllib wraps the error of a connection in its own.
             inner = error.reason if isinstance(error, URLError) else error
-            cause = cause_of(inner, is_encrypted(url), source.ca, "--ca")
-            raise InvalidInput(f"{url}: cannot be reached ({cause})") from None
+            cause = cause_of(inner, is_encrypted(self._url), self._ca, "--ca")
+            raise InvalidInput(f"{self._url}: cannot be reached ({cause})") from None
 
-    return get
+    def get_json(self, path: str) -> Any:
+        """Request JSON."""
+        text = self.get(path)
+        try:
+            return jsons.loads(text)
+        except ValueError as error:
+            raise InvalidInput(f"{self._url}: its answer is not JSON ({error}): is that a twin?") from None
+
+    def require_sound(self) -> None:
+        """Say the damage of the twin's store, where its health, which needs no token, tells any."""
+        damage = ""
+        with suppress(HTTPException, OSError, ValueError, LookupError, TypeError):
+            damage = jsons.loads(self._health() if self._answers else b"")["damage"]
+        if damage:
+            raise InvalidInput(
+                f"{self._url}: the twin's store is damaged ({damage}); call `servotwin twin check` there"
+            )
+
+    def _health(self) -> bytes:
+        try:
+            with self._open("/healthz") as response:
+                return bytes(response.read())
+        except HTTPError as error:  # 503 where a part is not healthy
+            with error:
+                return error.read()
+
+    def _open(self, path: str) -> Any:
+        return self._opener.open(Request(self._url + path, headers=self._headers), timeout=_TIMEOUT_S)
 
 
 def _is_address(url: str) -> bool:

@@ -1,15 +1,19 @@
-"""`servotwin twin check`: check every page of the twin's store, and every body against its digest."""
+"""`servotwin twin check`: check every page of the twin's store, and every body against its digest.
+
+Commands that read a store check its pages for a second, and end with the same sentences.
+"""
 
 from __future__ import annotations
 
 import math
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from rich.progress import Progress
 
 from servotwin.errors import InvalidInput
-from servotwin.store.engine import POSTGRESQL, SQLITE
+from servotwin.store.engine import POSTGRESQL, SQLITE, StoreUnavailable
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
@@ -17,6 +21,8 @@ from servotwin.twin_service.store_watch import lost_messages
 from servotwin.twin_service.twin_file import service_of
 
 _BODIES = 256
+_READING_S = 1.0
+"""s for which a command that reads a store checks its pages: the tables that it reads are the first ones."""
 _REMEDY = {SQLITE: "end the twin, move the file away", POSTGRESQL: "end all twins, create an empty database"}
 
 
@@ -29,14 +35,46 @@ def check_store(config: Path) -> None:
         The store is damaged, has lost messages, or cannot be opened.
     """
     with closing(open_existing_store(service_of(config))) as store:
-        _require_sound(store, check_pages(store, math.inf))
-        if lost := lost_messages(store, config):
-            raise InvalidInput(
-                f"store {store.name}: has lost messages ({lost}); a twin that starts on it asks the edges for the "
-                "windows that they still keep, or end the twin and restore a newer backup"
-            )
+        _require_whole(store, config, math.inf)
         checked = _check_bodies(store)
         print(f"store {store.name}: is sound ({checked} messages agree with their digests)")
+
+
+@contextmanager
+def store_to_read(config: Path) -> Iterator[Store]:
+    """Open the store of a twin's file for a block that shows what is in it; say after it what is wrong with the store.
+
+    Raises
+    ------
+    InvalidInput
+        The store is damaged, has lost messages, or cannot be opened.
+    """
+    with (
+        closing(open_existing_store(service_of(config))) as store,
+        telling_after(lambda: _require_whole(store, config, _READING_S)),
+    ):
+        yield store
+
+
+@contextmanager
+def telling_after(require_sound: Callable[[], None]) -> Iterator[None]:
+    """Raise the fault of a store after a block that shows what can still be read, or in place of the block's error."""
+    try:
+        yield
+    except (InvalidInput, StoreUnavailable):
+        require_sound()
+        raise
+    require_sound()
+
+
+def _require_whole(store: Store, config: Path, seconds: float) -> None:
+    """Check the pages for a time, s, and the number of the newest message."""
+    _require_sound(store, check_pages(store, seconds))
+    if lost := lost_messages(store, config):
+        raise InvalidInput(
+            f"store {store.name}: has lost messages ({lost}); a twin that starts on it asks the edges for the "
+            "windows that they still keep, or end the twin and restore a newer backup"
+        )
 
 
 def _check_bodies(store: Store) -> int:

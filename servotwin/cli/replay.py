@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from servotwin.cli.audit import known_servo
+from servotwin.cli.check import store_to_read
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
 from servotwin.messages.codec import decompress
@@ -17,8 +18,7 @@ from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.model_registry import ServoModel
 from servotwin.twin.replay import ReplayResult, replay
-from servotwin.twin_service.command import open_existing_store
-from servotwin.twin_service.twin_file import read_twin, service_of
+from servotwin.twin_service.twin_file import read_twin
 
 DEG = 180.0 / math.pi
 _PAGE = 100
@@ -68,12 +68,11 @@ def print_replay(servo: str, config: Path, window: str | None, present: bool) ->
     Raises
     ------
     InvalidInput
-        There is no store, or no such window in it.
+        There is no store, or no such window in it, or it is damaged.
     """
     only, model = _identity(window), read_twin(config).fleet.model_of(servo) if present else None
     counts, differing = Counter[str](), Counter[str]()
-    store = open_existing_store(service_of(config))
-    try:
+    with store_to_read(config) as store:
         for replayed in _replay_windows(store, servo, model, only):
             counts[replayed.result] += 1
             differing.update(replayed.differs)
@@ -81,11 +80,9 @@ def print_replay(servo: str, config: Path, window: str | None, present: bool) ->
                 print(f"window {replayed.window}: {replayed.detail}")
         if not counts:
             known_servo(store, servo)
-    finally:
-        store.close()
-    if not counts:
-        raise InvalidInput(f"servo {servo!r}: no window{'' if window is None else f' {window}'} of it was ever stored")
-    print(_summary(servo, counts, differing))
+            asked = "" if window is None else f" {window}"
+            raise InvalidInput(f"servo {servo!r}: no window{asked} of it was ever stored")
+        print(_summary(servo, counts, differing))
     return not any(counts[bad] for bad in BAD)
 
 

@@ -9,19 +9,20 @@ from threading import Thread
 import pytest
 from mosquitto import free_port
 
-from servotwin.cli.audit import Source, audit
+from servotwin.cli.audit import Source, audit, servos
 from servotwin.errors import InvalidInput
 
 
 @contextmanager
-def answering(status: int, text: bytes) -> Iterator[str]:
-    """A service with one answer; its URL."""
+def answering(status: int, text: bytes, data: bytes | None = None) -> Iterator[str]:
+    """A service with one answer, or another one to all but its health; its URL."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response(status)
+            other = data is not None and self.path != "/healthz"
+            self.send_response(200 if other else status)
             self.end_headers()
-            self.wfile.write(text)
+            self.wfile.write(data if other and data is not None else text)
 
         def log_message(self, *_args: object) -> None:
             pass
@@ -56,3 +57,13 @@ def test_a_service_that_is_away_is_named_once() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     assert said(url).startswith(f"{url}: cannot be reached (")
     assert said(url).count(url) == 1
+
+
+def test_a_service_whose_store_is_damaged_says_so_after_what_it_still_gives(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with answering(503, b'{"ok": false, "damage": "page 3 is noise"}', b"[]") as url:
+        with pytest.raises(InvalidInput) as refused:
+            servos(Source(Path("twin.toml"), url, None, None), True)
+        assert str(refused.value).startswith(f"{url}: the twin's store is damaged (page 3 is noise)")
+    assert capsys.readouterr().out == "[]\n"

@@ -36,6 +36,43 @@ def test_a_damaged_store_is_one_sentence(tmp_path: Path, command: list[str]) -> 
     assert "is damaged" in result.stderr
 
 
+def overwrite(file: Path, table: str) -> None:
+    """Overwrite the root page of a table with noise."""
+    with closing(sqlite3.connect(file)) as reader:
+        [(page,)] = reader.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,))
+        [(size,)] = reader.execute("PRAGMA page_size")
+    with file.open("r+b") as opened:
+        opened.seek((page - 1) * size)
+        opened.write(os.urandom(size))
+
+
+@pytest.mark.parametrize("command", [["servos"], ["servos", "--json"], ["audit", "ax-1"]])
+def test_what_a_damaged_store_still_gives_is_shown_with_the_damage(tmp_path: Path, command: list[str]) -> None:
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    store = open_store(str(file))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    overwrite(file, "bodies")
+    result = CliRunner().invoke(app, [*command, "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert "ax-1" in result.stdout
+    assert result.stderr.startswith(f"error: store sqlite:///{file}: is damaged (")
+    assert "restore a backup" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [["servos"], ["audit", "ax-1"], ["audit", "ax-2"]])
+def test_a_store_that_has_lost_messages_is_not_shown_as_whole(tmp_path: Path, command: list[str]) -> None:
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    store = open_store(str(file))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    (tmp_path / "twin.db-newest").write_text("9\n")
+    result = CliRunner().invoke(app, [*command, "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert "has lost messages (its newest message is number 4, and it once had number 9)" in result.stderr
+
+
 def test_a_store_is_checked_and_read_while_another_program_writes_to_it(tmp_path: Path) -> None:
     config, file = twin_file(tmp_path), tmp_path / "twin.db"
     store = open_store(str(file))
