@@ -16,6 +16,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
+from servotwin.store.integrity import STORED_BODIES, body_fault
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION
@@ -64,7 +65,7 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
     Raises
     ------
     InvalidInput
-        There is no store, it is in PostgreSQL, or the file exists or cannot be written.
+        There is no store, it is damaged or in PostgreSQL, or the file exists or cannot be written.
     """
     source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
     check_named(source, "store ")
@@ -138,13 +139,21 @@ def _copied(source: Path, target: Path, to: Path, progress: Progress | None) -> 
             original.execute("ROLLBACK")
         # Without a write-ahead log the copy is a single file.
         copy.execute("PRAGMA journal_mode = DELETE")
-        faults = [row[0] for row in copy.execute("PRAGMA integrity_check(1)")]
-        if faults != ["ok"]:
-            raise InvalidInput(f"store {source}: is damaged ({faults[0]}); restore an earlier backup")
+        if fault := _fault_of(copy):
+            raise InvalidInput(f"store {source}: is damaged ({fault}); restore an earlier backup")
         # Compared as well as checked: a copy may be sound and yet lack rows.
         if _counts(copy) != expected:
             raise InvalidInput(f"store {source}: its copy does not hold the same rows; try again")
         return expected
+
+
+def _fault_of(copy: sqlite3.Connection) -> str:
+    """First fault of a copy, its bodies compared with their digests: a twin would not write to it. Empty: none."""
+    (result,) = copy.execute("PRAGMA integrity_check(1)").fetchone()
+    if result != "ok":
+        return str(result).splitlines()[-1]  # the lines before tell the database, which is `main`
+    faults = (body_fault(*row) for row in copy.execute(str(STORED_BODIES)))
+    return next(filter(None, faults), "")
 
 
 def _copy_pages(original: sqlite3.Connection, copy: sqlite3.Connection, to: Path, progress: Progress | None) -> None:

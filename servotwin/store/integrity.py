@@ -13,7 +13,7 @@ from functools import partial
 from hashlib import blake2b
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
@@ -149,7 +149,7 @@ def check_bodies(store: Store, after: int, most: int) -> tuple[IntegrityReport, 
             rows = connection.execute(_BODIES, {"_after": after, "_most": most}).all()
     except StoreDamaged as error:
         return IntegrityReport((str(error),), False), after
-    faults = [fault for row in rows if (fault := _fault(row))]
+    faults = [fault for row in rows if (fault := body_fault(*row))]
     result = IntegrityReport(tuple(faults[:_MOST_FAULTS]), len(rows) < most, len(rows))
     return result, rows[-1].id if rows else after
 
@@ -232,24 +232,24 @@ def _opened(file: Path, over: Callable[[], bool]) -> sqlite3.Connection:
     return connection
 
 
-def _fault(row: Any) -> str:
+def body_fault(message: int, servo: str, encoding: str, digest: bytes, body: bytes) -> str:
     """Fault of a stored body; empty: none. A digest of another length was not made by `message_digest`."""
-    if len(row.digest) != _DIGEST_BYTES:
+    if len(digest) != _DIGEST_BYTES:
         return ""
     try:
-        sound = message_digest(decompress(row.body, row.encoding, MAX_BYTES)) == row.digest
+        sound = message_digest(decompress(body, encoding, MAX_BYTES)) == digest
     except InvalidMessage:
         sound = False
-    return "" if sound else f"message {row.id} of servo {row.servo!r}: its body differs from its digest"
+    return "" if sound else f"message {message} of servo {servo!r}: its body differs from its digest"
 
 
-_BODIES = (
+STORED_BODIES = (
     sa.select(messages.c.id, messages.c.servo, messages.c.encoding, messages.c.digest, bodies.c.body)
     .select_from(bodies.join(messages, messages.c.id == bodies.c.message))
-    .where(bodies.c.message > sa.bindparam("_after"))
     .order_by(bodies.c.message)
-    .limit(sa.bindparam("_most"))
 )
+"""Arguments of `body_fault` for each stored body."""
+_BODIES = STORED_BODIES.where(bodies.c.message > sa.bindparam("_after")).limit(sa.bindparam("_most"))
 _NEWEST = (
     sa.select(messages.c.boot, messages.c.sequence)
     .where(WINDOWS, messages.c.servo == sa.bindparam("_servo"))

@@ -20,6 +20,7 @@ from servotwin.messages import Resend, decode
 from servotwin.store import migrate as migrations
 from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.store.engine import transaction
+from servotwin.store.integrity import message_digest
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.schema import REVISION, bodies
@@ -123,6 +124,31 @@ def test_a_backup_and_a_restore_name_the_file_that_is_damaged_or_cannot_be_writt
         with pytest.raises(InvalidInput, match=rf"^store {damaged}: is damaged \("):
             copy()
     assert sorted(path.name for path in tmp_path.iterdir() if "copy" in path.name) == []
+
+
+def test_a_backup_with_a_body_that_changed_does_not_take_the_place_of_a_sound_one(url: str, tmp_path: Path) -> None:
+    store, saved = open_store(url), tmp_path / "backup.db"
+    store.put([window(sequence=n, body=b"%d" % n)._replace(digest=message_digest(b"%d" % n)) for n in range(3)])
+    counts = backup(url, saved)
+    with store.writing() as connection:
+        connection.execute(bodies.update().where(bodies.c.message == 2).values(body=b"x"))
+    store.close()
+    with pytest.raises(InvalidInput, match=r"is damaged \(message 2 of servo 'a': its body differs from its digest\)"):
+        backup(url, saved, replace=True)
+    assert restore(saved, f"sqlite:///{tmp_path}/again.db") == counts
+
+
+def test_a_damaged_page_is_told_on_one_line(url: str, tmp_path: Path) -> None:
+    store, file = open_store(url), tmp_path / "store.db"
+    store.put([window(body=os.urandom(100_000))])
+    store.close()
+    with file.open("r+b") as opened:
+        opened.seek(file.stat().st_size - 4 * 8192)
+        opened.write(bytes(8192))  # of the body, which counting rows does not read
+    with pytest.raises(InvalidInput) as refused:
+        backup(url, tmp_path / "copy.db")
+    assert "is damaged (" in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 @contextmanager
