@@ -101,6 +101,17 @@ class Kept(logging.Handler):
 
 
 @pytest.fixture(autouse=True)
+def own_logging() -> Iterator[None]:
+    """Undo the logging of a command that ran in this process: later lines would go to its closed stream."""
+    loggers = [logging.getLogger(name) for name in ("servotwin", "uvicorn")]
+    before = [(logger.handlers[:], logger.propagate, logger.level) for logger in loggers]
+    yield
+    for logger, (handlers, propagate, level) in zip(loggers, before, strict=True):
+        logger.handlers[:], logger.propagate = handlers, propagate
+        logger.setLevel(level)
+
+
+@pytest.fixture(autouse=True)
 def nothing_leaks() -> Iterator[None]:
     """Fail the test that leaves a thread running or an asyncio task pending."""
     before = set(threading.enumerate())
