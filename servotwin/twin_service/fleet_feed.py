@@ -34,6 +34,9 @@ _TICKS_BACK = 3
 """On a shared database a row with a lower id may be committed later: its servo is sent again for so many ticks."""
 _POSITION = re.compile(r"(\d{1,18})-(\d{1,18})")
 
+_NOT_READ = "The twin cannot read its store now."
+_DAMAGED = "The twin's store is damaged: no window is stored until it is sound, and edges keep theirs."
+
 
 class FleetFeed:
     """Sends changes to watchers.
@@ -46,6 +49,8 @@ class FleetFeed:
         Watchers at once.
     shared : bool
         Other processes write to the store.
+    damage : callable
+        Fault of the store; empty: there is none. Where it has one nothing is written to it, and what is read is old.
 
     Attributes
     ----------
@@ -54,8 +59,10 @@ class FleetFeed:
     watchers : int
     """
 
-    def __init__(self, changes: ChangeReader, presence: EdgePresence, limit: int, shared: bool) -> None:
-        self._changes, self._presence = changes, presence
+    def __init__(
+        self, changes: ChangeReader, presence: EdgePresence, limit: int, shared: bool, damage: Callable[[], str]
+    ) -> None:
+        self._changes, self._presence, self._damage = changes, presence, damage
         self._limit, self.closing, self._open = limit, asyncio.Event(), 0
         self._queues: set[asyncio.Queue[bytes | None]] = set()
         self._positions: deque[StorePosition] = deque(maxlen=_TICKS_BACK if shared else 1)
@@ -135,9 +142,9 @@ class FleetFeed:
             if not first:
                 return []
             if isinstance(error, StoreUnavailable):
-                return [_event("trouble", None, b'"the twin cannot read its store now"')]
+                return [self._trouble()]
             log.exception("the feed of the fleet failed")
-            return [_event("trouble", None, b'"the twin cannot follow the fleet now"')]
+            return [_event("trouble", None, b'"The twin cannot follow the fleet now."')]
 
     async def _begin(self) -> None:
         """Begin at the present position, unless the feed has one."""
@@ -165,15 +172,21 @@ class FleetFeed:
         try:
             return (await self._events(after, (), True))[0]
         except StoreUnavailable:
-            return [_event("trouble", None, b'"the twin cannot read its store now"')]
+            return [self._trouble()]
+
+    def _trouble(self) -> bytes:
+        """Event that says why the fleet cannot be followed."""
+        return _event("trouble", None, f'"{_DAMAGED if self._damage() else _NOT_READ}"'.encode())
 
     async def _events(
         self, since: StorePosition, names: Collection[str], empty: bool
     ) -> tuple[list[bytes], StorePosition]:
         """Events, and the position after them; only the last one has it, from which a broken stream resumes.
 
-        `empty`: send an event of no rows where nothing changed.
+        `empty`: send an event of no rows where nothing changed. Raises StoreUnavailable also where only reading works.
         """
+        if fault := self._damage():
+            raise StoreUnavailable(fault)
         connected, sole = self._presence.connected()
         found = await self._changes.read(ChangesQuestion(since, tuple(names), connected, sole, _ROWS, _MOST))
         if found.many:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from servotwin.store.engine import POSTGRESQL, sqlite_file
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import EdgeGate
@@ -32,6 +34,8 @@ class PageService:
     ----------
     twin : TwinFile
     store : Store
+    damage : callable
+        Fault of the store; empty: there is none.
     presence : EdgePresence
     claims : EdgeClaims
         Tells which edge may stream samples.
@@ -52,13 +56,20 @@ class PageService:
     """
 
     def __init__(
-        self, twin: TwinFile, store: Store, presence: EdgePresence, claims: EdgeClaims, clocks: Clocks, shared: bool
+        self,
+        twin: TwinFile,
+        store: Store,
+        damage: Callable[[], str],
+        presence: EdgePresence,
+        claims: EdgeClaims,
+        clocks: Clocks,
+        shared: bool,
     ) -> None:
         self._config, self._store, self._monotonic = twin.service, store, clocks.monotonic
         self.readers = StoreExecutor(_READERS, "readers")
         self.fleet = FleetReader(store, presence, clocks.wall)
         self.changes = ChangeReader(self.fleet, self.readers, _readable_elsewhere(store))
-        self.feed = FleetFeed(self.changes, presence, self._config.watchers, shared)
+        self.feed = FleetFeed(self.changes, presence, self._config.watchers, shared, damage)
         self._live_views = LiveViews(self._monotonic, presence, self._config.watchers, self._config.long_polls)
         self.live_intake = LiveIntake(claims, self._live_views, self._monotonic)
         self.what_if = WhatIfProcess(twin.start, self._monotonic)

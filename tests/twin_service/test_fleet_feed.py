@@ -125,7 +125,8 @@ def test_an_event_goes_to_one_watcher_at_a_time(tmp_path):
 
 def feed_of(system):
     """A feed that looks only when it is told to."""
-    return FleetFeed(ChangeReader(system.pages.fleet, system.executor), system.pages.fleet._presence, 2, False)
+    changes, presence = ChangeReader(system.pages.fleet, system.executor), system.pages.fleet._presence
+    return FleetFeed(changes, presence, 2, False, lambda: system.watch.fault)
 
 
 @pytest.mark.parametrize("fault", [StoreUnavailable("locked"), ValueError("unforeseen")])
@@ -144,6 +145,22 @@ def test_a_look_that_fails_is_told_and_repeated_from_the_same_place(tmp_path, mo
         monkeypatch.setattr(system.pages.fleet, "rows", rows)
         assert b'"servo":"ax-2"' in (await feed._look())[0]
         assert await feed._look() == []
+
+    with_service(tmp_path, body)
+
+
+def test_pages_are_told_that_the_store_is_damaged_although_it_can_be_read(tmp_path):
+    async def body(system, _client):
+        await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
+        feed, begun = feed_of(system), position(system)
+        await feed._changed()
+        system.watch.fault = "page 3 is noise"
+        assert b"event: trouble" in (told := (await feed._look())[0])
+        assert b"The twin's store is damaged" in told
+        assert await feed._since(begun) == [told]  # a page that comes now
+        assert await feed._look() == []  # said once
+        system.watch.fault = ""
+        assert b"event: rows" in (await feed._look())[0]
 
     with_service(tmp_path, body)
 

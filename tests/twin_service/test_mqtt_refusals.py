@@ -62,7 +62,9 @@ def server(metrics: Metrics) -> tuple[MqttServer, NotingConnection]:
     limiter = RateLimiter(1e6, 1e6, lambda: 0.0)
     gate = EdgeGate(AccessControl(VERIFIERS), lambda _: True, limiter, limiter)
     parts: Any = gate, Rejecting(), None, Unclaimed(), None, lambda: None
-    made = MqttServer(Broker("mqtt://127.0.0.1"), MqttRequestHandler(*parts, Refusals(metrics, monotonic=lambda: 0.0)), "twins")
+    made = MqttServer(
+        Broker("mqtt://127.0.0.1"), MqttRequestHandler(*parts, Refusals(metrics, monotonic=lambda: 0.0)), "twins"
+    )
     connection: Any = NotingConnection()
     made._connection = connection
     return made, connection
