@@ -227,7 +227,7 @@ class _Service:
     def get(self, path: str) -> bytes:
         """Request a path."""
         try:
-            with self._open(path) as response:
+            with self._open(path, self._headers) as response:
                 self._answers, body = True, bytes(response.read())
                 return body
         except HTTPError as error:
@@ -259,14 +259,14 @@ class _Service:
 
     def _health(self) -> bytes:
         try:
-            with self._open("/healthz") as response:
+            with self._open("/healthz", {}) as response:
                 return bytes(response.read())
         except HTTPError as error:  # 503 where a part is not healthy
             with error:
                 return error.read()
 
-    def _open(self, path: str) -> Any:
-        return self._opener.open(Request(self._url + path, headers=self._headers), timeout=_TIMEOUT_S)
+    def _open(self, path: str, headers: dict[str, str]) -> Any:
+        return self._opener.open(Request(self._url + path, headers=headers), timeout=_TIMEOUT_S)
 
 
 def _is_address(url: str) -> bool:

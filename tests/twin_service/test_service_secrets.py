@@ -56,4 +56,4 @@ def test_an_operator_s_token_follows_no_redirection(tmp_path):
             audit("ax-1", source, 1, changes=False, json=True)
         server.shutdown()
         thread.join()
-    assert requests == [("/v1/servos/ax-1/audit?limit=1", "Bearer hunter2")]
+    assert requests == [("/v1/servos/ax-1/audit?limit=1", "Bearer hunter2"), ("/healthz", None)]
