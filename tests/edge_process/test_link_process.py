@@ -73,7 +73,7 @@ def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_pro
 
 
 def test_once_a_window_comes_through_again_the_edge_asks_for_messages_at_once(tmp_path: Path, twin: FakeTwin) -> None:
-    """Each way has its pauses after an outage: updates came half a minute after the windows, most of them expired."""
+    """Each way has its pauses after an outage: for some 20 s updates came too late, and were refused."""
     (tmp_path / "edge.toml").write_text(EDGE.format(url=twin.url))
     (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("first")
