@@ -13,10 +13,13 @@ from typing import Any, NamedTuple
 from servotwin.edge.outlet import FILTERED, NOT_FINITE
 from servotwin.edge_process.outlet import BEHIND
 from servotwin.link.outbox import FULL
-from servotwin.link.sqlite_outbox import BROKEN, INCOMPLETE, LETTERS, UNWRITABLE
+from servotwin.link.outbox_contents import BROKEN, UNWRITABLE
+from servotwin.link.sqlite_outbox import ANOTHER, INCOMPLETE, LETTERS, MOVED
+from servotwin.messages import Refusal
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.prometheus import Sample, metric_lines
 
+_REFUSED = tuple(refusal.value for refusal in Refusal if not refusal.temporary)
 _READABLE = 0o644
 """The collector runs as another user; nothing in the file is secret."""
 
@@ -46,10 +49,17 @@ _METRICS = (
         "Windows that were never sent, by reason.",
         ("windows", "dropped"),
         "reason",
-        (BEHIND, BROKEN, FILTERED, FULL, INCOMPLETE, LETTERS, NOT_FINITE, UNWRITABLE),
+        (BEHIND, BROKEN, FILTERED, FULL, INCOMPLETE, LETTERS, NOT_FINITE, UNWRITABLE, *_REFUSED),
     ),
     _Metric("servotwin_edge_disk_safe", "gauge", "1: all that must be on the disk is there.", ("disk", "safe")),
-    _Metric("servotwin_edge_disk_faults_total", "counter", "Faults of the disk.", ("disk", "faults"), "fault"),
+    _Metric(
+        "servotwin_edge_disk_faults_total",
+        "counter",
+        "Faults of the disk.",
+        ("disk", "faults"),
+        "fault",
+        (ANOTHER, BROKEN, INCOMPLETE, MOVED, UNWRITABLE),
+    ),
     _Metric("servotwin_edge_version", "gauge", "Version of the setting in force.", ("version",)),
     _Metric("servotwin_edge_fallback", "gauge", "1: the fallback set is in force.", ("fallback",)),
     _Metric("servotwin_edge_conflict", "gauge", "1: another edge of the servo has taken over.", ("conflict",)),

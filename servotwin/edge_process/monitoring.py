@@ -66,13 +66,16 @@ def log(event: str, **values: Any) -> None:
 
 
 def log_outbox(outbox: SqliteOutbox) -> None:
-    """Log, once, what an outbox found in place of its file: an incomplete one, another servo's, a corrupt one."""
+    """Log, once, what an outbox found in place of its file: an incomplete one, another servo's, a corrupt one, none."""
     if outbox.missing:
         log("outbox incomplete", lost=outbox.missing)
         outbox.missing = 0
     while outbox.others:
         other = outbox.others.pop(0)
         log("outbox of another servo", file=other.file.name, of=other.servo, windows=other.waiting)
+    while outbox.moves:
+        moved = outbox.moves.pop(0)
+        log("outbox moved", files=moved.files, **({} if moved.aside is None else {"aside": moved.aside.name}))
     while outbox.salvages:
         found = outbox.salvages.pop(0)
         log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)

@@ -28,6 +28,7 @@ from servotwin.link.sqlite_file import (
 )
 
 DROPPED = "dropped: "
+BROKEN, UNWRITABLE = "outbox broken", "disk not writable"
 
 
 class OutboxContents:

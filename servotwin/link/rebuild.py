@@ -14,8 +14,9 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from servotwin.link.outbox import Key
+from servotwin.link.outbox_contents import BROKEN, UNWRITABLE, OutboxContents
 from servotwin.link.salvage import Row, Salvaged, salvage
-from servotwin.link.sqlite_file import BESIDE, INSERT, INSERT_AT, Statement, connect, put_aside
+from servotwin.link.sqlite_file import BESIDE, INSERT, INSERT_AT, NOTE, SERVO, Statement, connect, put_aside
 
 _BATCH = 4_000_000
 """Bytes of windows in one transaction."""
@@ -46,7 +47,7 @@ class Rebuild:
     """
 
     def __init__(self, path: Path, known: set[Key], most: int) -> None:
-        self._path, self._new = path, _new_of(path)
+        self._path, self._new = path, new_of(path)
         self.in_memory: list[Row] = []
         self.dropped: set[Key] = set()
         try:
@@ -96,6 +97,46 @@ class Rebuild:
         return found
 
 
+def rebuilt(path: Path, servo: str, contents: OutboxContents, waiting: int | None, most: int) -> tuple[Rebuild, int]:
+    """Read a corrupt file, and take over its letters, counts and values; what is in memory is newer.
+
+    Parameters
+    ----------
+    path : Path
+    servo : str
+        Whose outbox it should be.
+    contents : OutboxContents
+    waiting : int or None
+        Windows that waited by the last status, where the file was not open since.
+    most : int
+        As for `Rebuild`.
+
+    Returns
+    -------
+    Rebuild, int
+        To be renamed; and the number of windows that are lost, which is counted.
+    """
+    in_memory = {key for kind, key in contents.unwritten if kind == "window"}
+    rebuild = Rebuild(path, in_memory, most)
+    found, known = rebuild.found, rebuild.found.windows | rebuild.dropped | in_memory
+    owner = found.notes.get(SERVO, servo.encode())
+    if owner != servo.encode():
+        rebuild.complete([Statement(NOTE, (SERVO, owner))])  # it is put aside, too, when it is opened
+        return rebuild, len(found.lost)
+    # Known by name: from memory where the file was open before, and from what is left of the file.
+    lost = (contents.index.keys() | found.lost) - known
+    # The number of the last status is old by up to a second: it counts only where the names are not known.
+    unnamed = not (contents.index or found.lost_is_complete)
+    number = max(len(lost), (waiting or 0) - len(known - in_memory) if unnamed else 0)
+    contents.replace(found, rebuild.in_memory, in_memory)
+    contents.count_dropped(BROKEN, number)
+    contents.count_dropped(UNWRITABLE, len(rebuild.dropped))
+    contents.count(BROKEN)
+    contents.write_all_numbers()
+    rebuild.complete(contents.unwritten.values())
+    return rebuild, number
+
+
 def adopt(path: Path) -> None:
     """Give an outbox's name to the new file that was made in its place, where no file has it.
 
@@ -103,8 +144,10 @@ def adopt(path: Path) -> None:
     ------
     OSError
     """
-    new = _new_of(path)
+    new = new_of(path)
     if new.exists() and not path.exists():
+        for end in BESIDE:  # of the former file, whose rows the new one has: SQLite would apply that log to it
+            path.with_name(path.name + end).unlink(missing_ok=True)
         new.rename(path)
         folder = os.open(path.parent, os.O_RDONLY)
         try:
@@ -113,7 +156,8 @@ def adopt(path: Path) -> None:
             os.close(folder)
 
 
-def _new_of(path: Path) -> Path:
+def new_of(path: Path) -> Path:
+    """Name of the file that is made in an outbox's place."""
     return path.with_name(f"{path.name}.new")
 
 

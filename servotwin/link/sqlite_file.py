@@ -115,7 +115,7 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     sqlite3.Error
         The file cannot be opened, or is corrupt (`is_broken`).
     """
-    _make_private(path)
+    make_private(path)
     # The outbox begins its transactions itself, and its lock guards the connection for all threads.
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
     try:
@@ -165,7 +165,7 @@ def _owner_of(connection: sqlite3.Connection) -> str:
     return ""
 
 
-def _make_private(path: Path) -> None:
+def make_private(path: Path) -> None:
     """Make the file where there is none, and let its owner alone open it; SQLite gives its log the same mode."""
     with suppress(OSError):
         # With its mode from the start: between creation and a chmod others could open it.

@@ -18,17 +18,17 @@ from threading import RLock
 from typing import Any
 
 from servotwin.errors import InvalidInput
+from servotwin.link.moved_file import MovedFiles, write_anew
 from servotwin.link.outbox import Dropped, Key
-from servotwin.link.outbox_contents import DROPPED, OutboxContents
+from servotwin.link.outbox_contents import BROKEN, DROPPED, UNWRITABLE, OutboxContents
 from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, LastStatus
-from servotwin.link.rebuild import Rebuild, adopt
+from servotwin.link.rebuild import Rebuild, adopt, rebuilt
 from servotwin.link.salvage import Salvage
 from servotwin.link.sqlite_file import (
-    NOTE,
+    BESIDE,
     SERVO,
     STORED,
     OtherOutbox,
-    Statement,
     check_kind,
     connect,
     connect_own,
@@ -38,9 +38,10 @@ from servotwin.link.sqlite_file import (
 from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
 from servotwin.messages.codec import DEFLATE, deflated
+from servotwin.runtime.files import FilesInPlace
 
-BROKEN, INCOMPLETE, ANOTHER = "outbox broken", "outbox incomplete", "outbox of another servo"
-UNWRITABLE, LETTERS = "disk not writable", "letters full"
+INCOMPLETE, ANOTHER, MOVED = "outbox incomplete", "outbox of another servo", "outbox moved"
+LETTERS = "letters full"
 MOST_UNWRITTEN = 16_000_000
 """Bytes of windows held in memory while the disk cannot be written."""
 _MOST_LETTERS = 10_000
@@ -78,6 +79,8 @@ class SqliteOutbox:
         Corrupt files of this process.
     others : list of OtherOutbox
         Files of other servos that were in this one's place.
+    moves : list of MovedFiles
+        Files of this outbox that were deleted, moved or replaced, and are written anew.
     missing : int
         Windows that waited at the last status, and are not in the file: it is an older one, or without its log.
     empty : bool
@@ -103,9 +106,11 @@ class SqliteOutbox:
         self._stored, self.missing, self.empty = 0, 0, False
         self.salvages: list[Salvage] = []
         self.others: list[OtherOutbox] = []
+        self.moves: list[MovedFiles] = []
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
-        self._read_only = False
+        self._files = FilesInPlace(())
+        self._read_only, self._displaced = False, False
         self._in_transaction = False
         self._rebuild: tuple[Rebuild, int] | None = None
         self.faults: Counter[str] = Counter()
@@ -129,7 +134,7 @@ class SqliteOutbox:
     def flushed(self) -> bool:
         """Everything is on the disk."""
         with self._lock:
-            return not self._contents.unwritten and self._connection is not None
+            return not (self._contents.unwritten or self._displaced or self._connection is None)
 
     def put(self, window: WindowMessage) -> list[Dropped]:
         """Store a window; return the windows dropped to make room. It is on the disk unless `flushed` is False."""
@@ -300,14 +305,17 @@ class SqliteOutbox:
     def _write(self) -> None:
         if self._connection is None:
             adopt(self._path)  # of a process that was killed between two renames
-            self._connection, other = connect_own(self._path, self._servo)
+            connection, other = connect_own(self._path, self._servo)
+            self._use(connection)
             if other is not None:
                 self.faults[ANOTHER] += 1
                 self.others.append(other)
-            self._load(self._connection)
+            self._load(connection)
         if self._read_only:
             self.close()  # before connecting again: connections of one process to one file share its state
-            self._connection = connect(self._path, check=False)
+            self._use(connect(self._path, check=False))
+        assert self._connection is not None
+        self._keep_place(self._connection)
         if self._contents.unwritten:
             # IMMEDIATE takes the write lock now: a file that is locked fails here, before the first statement.
             self._connection.execute("BEGIN IMMEDIATE")
@@ -316,6 +324,19 @@ class SqliteOutbox:
             self._connection.execute("COMMIT")
             self._contents.unwritten.clear()
         self.trouble = ""
+
+    def _use(self, connection: sqlite3.Connection) -> None:
+        self._connection, self._displaced = connection, False
+        self._files = FilesInPlace(self._path.with_name(self._path.name + end) for end in ("", *BESIDE[:1]))
+
+    def _keep_place(self, connection: sqlite3.Connection) -> None:
+        """Go on in a new file where the present one, or its log, was deleted, moved or replaced."""
+        changed = self._files.changed()
+        if changed:
+            self._displaced = True
+            self.moves.append(write_anew(connection, self._path, changed))
+            self.faults[MOVED] += 1
+            self._use(connect(self._path, check=False))
 
     def _load(self, connection: sqlite3.Connection) -> None:
         """Load the file's contents, and count the windows that it lacks."""
@@ -353,8 +374,9 @@ class SqliteOutbox:
         self.close()
         if self._rebuild is None:
             self.faults[BROKEN] += 1
-            self._salvage()
-        assert self._rebuild is not None
+            waiting = None if self._last is None else self._last.waiting
+            self._rebuild = rebuilt(self._path, self._servo, self._contents, waiting, MOST_UNWRITTEN)
+            self._last = None
         rebuild, lost = self._rebuild
         try:
             aside = rebuild.rename()
@@ -364,32 +386,6 @@ class SqliteOutbox:
         self._rebuild = None
         self.salvages.append(Salvage(aside, len(rebuild.found.windows), lost))
         self.flush()
-
-    def _salvage(self) -> None:
-        """Read the corrupt file, and take over its letters, counts and values; what is in memory is newer."""
-        contents = self._contents
-        in_memory = {key for kind, key in contents.unwritten if kind == "window"}
-        rebuild = Rebuild(self._path, in_memory, MOST_UNWRITTEN)
-        found, known = rebuild.found, rebuild.found.windows | rebuild.dropped | in_memory
-        owner = found.notes.get(SERVO, self._servo.encode())
-        if owner != self._servo.encode():
-            rebuild.complete([Statement(NOTE, (SERVO, owner))])  # it is put aside, too, when it is opened
-            self._rebuild = rebuild, len(found.lost)
-            return
-        # Known by name: from memory where the file was open before, and from what is left of the file.
-        lost = (contents.index.keys() | found.lost) - known
-        # The number of the last status is old by up to a second: it counts only where the names are not known.
-        unnamed = not (contents.index or found.lost_is_complete)
-        waiting = 0 if self._last is None else self._last.waiting
-        number = max(len(lost), waiting - len(known - in_memory) if unnamed else 0)
-        contents.replace(found, rebuild.in_memory, in_memory)
-        contents.count_dropped(BROKEN, number)
-        contents.count_dropped(UNWRITABLE, len(rebuild.dropped))
-        contents.count(BROKEN)
-        contents.write_all_numbers()
-        self._last = None
-        rebuild.complete(contents.unwritten.values())
-        self._rebuild = rebuild, number
 
     def _read(self, text: str, values: tuple[Any, ...]) -> list[Any]:
         try:

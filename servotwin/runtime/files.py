@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,34 @@ def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | 
         with suppress(OSError):
             beside.unlink(missing_ok=True)
         raise
+
+
+def file_identity(place: Path) -> tuple[int, int] | tuple[()] | None:
+    """Device and inode of the file in a place; (): there is none; None: it cannot be told."""
+    try:
+        status = place.stat()
+    except FileNotFoundError:
+        return ()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+class FilesInPlace:
+    """Files that a process has open, by their places.
+
+    Parameters
+    ----------
+    places : iterable of Path
+        Those in which there is no file, or none that can be looked at, are left out.
+    """
+
+    def __init__(self, places: Iterable[Path]) -> None:
+        self._known = {place: one for place in places if (one := file_identity(place))}
+
+    def changed(self) -> list[Path]:
+        """Places whose file was deleted, moved or replaced since: what is written to it is gone with the process."""
+        return [place for place, one in self._known.items() if file_identity(place) not in (one, None)]
 
 
 @contextmanager

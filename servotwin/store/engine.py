@@ -21,6 +21,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import QueuePool
 
 from servotwin.errors import InvalidInput, ResourceUnavailable
+from servotwin.runtime.files import FilesInPlace
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
@@ -285,25 +286,14 @@ def _check_files(connection: sa.Connection) -> None:
     file = sqlite_file(connection.engine.url)
     if file is None:
         return
-    places = file, file.with_name(f"{file.name}-wal")
-    known = connection.info.setdefault("files", {place: one for place in places if (one := _identity(place))})
-    changed = [place.name for place, one in known.items() if _identity(place) not in (one, None)]
+    if "files" not in connection.info:
+        connection.info["files"] = FilesInPlace((file, file.with_name(f"{file.name}-wal")))
+    changed = [place.name for place in connection.info["files"].changed()]
     if changed:
         raise StoreDamaged(
             f"store {public_address(connection.engine.url)}: is damaged ({' and '.join(changed)}: deleted, moved or "
             "replaced while the store was open)"
         )
-
-
-def _identity(place: Path) -> tuple[int, int] | tuple[()] | None:
-    """Device and inode of the file in a place; (): there is none; None: it cannot be told."""
-    try:
-        status = place.stat()
-    except FileNotFoundError:
-        return ()
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
 
 
 def _set_pragma(connection: Any, pragma: str) -> None:

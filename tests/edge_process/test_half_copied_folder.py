@@ -199,3 +199,30 @@ def test_a_status_that_was_cut_tells_nothing_and_stops_nothing(folder: Path, sha
     with link(folder) as process:
         assert len(process.outbox.pending()) == WINDOWS
         assert process.outbox.dropped == {}
+
+
+def test_an_outbox_that_is_deleted_while_its_edge_runs_is_made_again_and_said(
+    folder: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with link(folder) as process:
+        for path in folder.glob("outbox.sqlite*"):
+            path.unlink()
+        with monkeypatch.context() as patched:
+            patched.setattr("servotwin.link.moved_file._require_room", no_room)
+            process._check()
+            disk = (read_status(folder / "status.json") or {})["disk"]
+            assert not disk["safe"]
+            assert disk["trouble"].startswith("outbox.sqlite and outbox.sqlite-wal: deleted, moved or replaced")
+        process._check()
+        disk = (read_status(folder / "status.json") or {})["disk"]
+        assert (disk["safe"], disk["trouble"], disk["faults"]["outbox moved"]) == (True, "", 1)
+    with link(folder) as process:
+        assert (process.outbox.waiting, process.outbox.dropped) == (WINDOWS, {})
+    lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
+    assert [line["files"] for line in lines if line["event"] == "outbox moved"] == [
+        ["outbox.sqlite", "outbox.sqlite-wal"]
+    ]
+
+
+def no_room(*_: object) -> None:
+    raise OSError(28, "No space left on device")

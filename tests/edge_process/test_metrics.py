@@ -18,7 +18,9 @@ STATUS = {
 def test_every_number_of_the_status_is_a_metric() -> None:
     lines = metrics_text(STATUS).splitlines()
     assert 'servotwin_edge_windows_dropped_total{servo="ax-1",reason="refused: too_large"} 3' in lines
-    assert 'servotwin_edge_windows_dropped_total{servo="ax-1",reason="outbox broken"} 0' in lines
+    for reason in ("outbox broken", "too_large"):
+        assert f'servotwin_edge_windows_dropped_total{{servo="ax-1",reason="{reason}"}} 0' in lines
+    assert 'servotwin_edge_disk_faults_total{servo="ax-1",fault="outbox moved"} 0' in lines
     expected = {
         "written_seconds": "1000000000", "samples_total": "5000", "windows_cut_total": "7", "windows_waiting": "2",
         "disk_safe": "1", "version": "3", "fallback": "0", "conflict": "1", "tolerance_metres": "2.5e-05",

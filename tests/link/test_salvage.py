@@ -14,9 +14,10 @@ import pytest
 from outbox_cases import filled, window
 
 from servotwin.link import rebuild, sqlite_outbox
+from servotwin.link.outbox_contents import BROKEN, UNWRITABLE
 from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.salvage import salvage
-from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
+from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import encode
 from servotwin.messages.codec import deflated
 

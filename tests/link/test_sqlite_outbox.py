@@ -16,10 +16,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
+from servotwin.link.outbox_contents import BROKEN, UNWRITABLE
 from servotwin.link.outbox_index import AcknowledgedLimits
 from servotwin.link.session import Session
 from servotwin.link.sqlite_file import connect
-from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
+from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.runtime.retry import Retry
 
