@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from servotwin.link.rebuild import adopt, new_of
-from servotwin.link.sqlite_file import is_broken, make_private, put_aside
+from servotwin.link.sqlite_file import make_private, put_aside
+from servotwin.runtime.sqlite_damage import is_damage
 
 
 class MovedFiles(NamedTuple):
@@ -52,7 +53,7 @@ def write_anew(connection: sqlite3.Connection, path: Path, changed: Sequence[Pat
             _empty_log(connection)  # into the database, which is in its place
             connection.close()
     except (sqlite3.Error, OSError) as error:
-        if isinstance(error, sqlite3.Error) and is_broken(error):
+        if isinstance(error, sqlite3.Error) and is_damage(error):
             raise
         why = getattr(error, "strerror", None) or str(error)
         moved = "deleted, moved or replaced while the outbox was open"

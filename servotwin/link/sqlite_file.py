@@ -46,7 +46,6 @@ _WAITING = (
     f"SELECT count(*) FROM windows LEFT JOIN acknowledged USING (boot, sequence) WHERE ifnull(at, {AGAIN}) = {AGAIN}"
 )
 STORED = "SELECT seq FROM sqlite_sequence WHERE name = 'windows'"
-_BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _STORES_TABLE = "servotwin_version"
 _PUT_BACK = "move it to its place, or give another name"
 BESIDE = ("-wal", "-shm")
@@ -74,11 +73,6 @@ class OtherOutbox(NamedTuple):
     file: Path
     servo: str
     waiting: int
-
-
-def is_broken(error: sqlite3.Error) -> bool:
-    """True where the file is corrupt; otherwise the error may pass."""
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF in _BROKEN
 
 
 def was_read_only(error: Exception) -> bool:
@@ -113,7 +107,7 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     Raises
     ------
     sqlite3.Error
-        The file cannot be opened, or is corrupt (`is_broken`).
+        The file cannot be opened, or is corrupt (`is_damage`).
     """
     make_private(path)
     # The outbox begins its transactions itself, and its lock guards the connection for all threads.
@@ -137,7 +131,7 @@ def connect_own(path: Path, servo: str) -> tuple[sqlite3.Connection, OtherOutbox
     Raises
     ------
     sqlite3.Error
-        The file cannot be opened, or is corrupt (`is_broken`).
+        The file cannot be opened, or is corrupt (`is_damage`).
     OSError
         It is of another servo, and cannot be renamed.
     """

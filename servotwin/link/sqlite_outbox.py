@@ -32,13 +32,13 @@ from servotwin.link.sqlite_file import (
     check_kind,
     connect,
     connect_own,
-    is_broken,
     was_read_only,
 )
 from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
 from servotwin.messages.codec import DEFLATE, deflated
 from servotwin.runtime.files import FilesInPlace
+from servotwin.runtime.sqlite_damage import is_damage
 
 INCOMPLETE, ANOTHER, MOVED = "outbox incomplete", "outbox of another servo", "outbox moved"
 LETTERS = "letters full"
@@ -353,7 +353,7 @@ class SqliteOutbox:
     def _failed(self, error: Exception) -> None:
         """Go on without the disk, or with a new file."""
         self.trouble = str(error)
-        if isinstance(error, sqlite3.Error) and is_broken(error):
+        if isinstance(error, sqlite3.Error) and is_damage(error):
             self._begin_anew()
             return
         self.faults[UNWRITABLE] += 1

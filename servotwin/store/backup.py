@@ -15,6 +15,7 @@ from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
+from servotwin.runtime.sqlite_damage import damage_words
 from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
 from servotwin.store.integrity import STORED_BODIES, body_fault
 from servotwin.store.migrate import VERSIONS
@@ -153,7 +154,12 @@ def _fault_of(copy: sqlite3.Connection) -> str:
     if result != "ok":
         return str(result).splitlines()[-1]  # the lines before tell the database, which is `main`
     faults = (body_fault(*row) for row in copy.execute(str(STORED_BODIES)))
-    return next(filter(None, faults), "")
+    try:
+        return next(filter(None, faults), "")
+    except sqlite3.OperationalError as error:
+        if is_damage(error):
+            return damage_words(error)
+        raise
 
 
 def _copy_pages(original: sqlite3.Connection, copy: sqlite3.Connection, to: Path, progress: Progress | None) -> None:
@@ -178,7 +184,7 @@ def _opened(path: Path, mode: str, to: Path | None = None) -> Iterator[sqlite3.C
         if to is not None:
             raise _not_written(to, error) from None
         fault = "is damaged" if is_damage(error) else "cannot be read or written"
-        raise InvalidInput(f"store {path}: {fault} ({error})") from None
+        raise InvalidInput(f"store {path}: {fault} ({damage_words(error)})") from None
 
 
 def _not_written(to: Path, error: sqlite3.Error) -> InvalidInput:

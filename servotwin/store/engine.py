@@ -21,7 +21,9 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import QueuePool
 
 from servotwin.errors import InvalidInput, ResourceUnavailable
+from servotwin.runtime import sqlite_damage
 from servotwin.runtime.files import FilesInPlace
+from servotwin.runtime.sqlite_damage import damage_words
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
@@ -45,7 +47,7 @@ _LOG_PAGES = 2000
 _READERS = 8
 _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 """Raised as they are: the statement is wrong, and repeating it does not help."""
-_SQLITE_DAMAGE, _SQL_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB), ("XX001", "XX002")
+_SQL_DAMAGE = ("XX001", "XX002")
 _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
 _NOT_AS_MADE = ("3F000", "42P01", "42703", "42501")
@@ -185,7 +187,9 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
         if isinstance(error, _CALLERS_FAULT) and _is_of_the_statement(error):
             raise
         if is_damage(error.orig):
-            raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error.orig})") from error.orig
+            raise StoreDamaged(
+                f"store {public_address(engine.url)}: is damaged ({damage_words(error.orig)})"
+            ) from error.orig
         raise _unavailable(engine, str(error.orig)) from error.orig
     except (PoolTimeout, sqlite3.Error) as error:
         raise _unavailable(engine, str(error)) from None
@@ -197,9 +201,8 @@ def lost_race(error: StoreUnavailable) -> bool:
 
 
 def is_damage(error: BaseException | None) -> bool:
-    """Test for the errors of SQLite and PostgreSQL that name damage: CORRUPT, NOTADB; data or index corrupted."""
-    code = getattr(error, "sqlite_errorcode", None)
-    return (code is not None and code & 0xFF in _SQLITE_DAMAGE) or getattr(error, "sqlstate", None) in _SQL_DAMAGE
+    """Test for the errors of SQLite and PostgreSQL that name damage; of the latter: data or index corrupted."""
+    return sqlite_damage.is_damage(error) or getattr(error, "sqlstate", None) in _SQL_DAMAGE
 
 
 def _is_of_the_statement(error: DBAPIError) -> bool:

@@ -19,6 +19,7 @@ import sqlalchemy as sa
 
 from servotwin.messages import MAX_BYTES, InvalidMessage
 from servotwin.messages.codec import decompress
+from servotwin.runtime.sqlite_damage import damage_words
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, is_damage, sqlite_file, transaction
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.postgresql_tables import table_faults
@@ -128,7 +129,7 @@ def check_pages(
                 checked += 1
     except sqlite3.Error as error:
         if is_damage(error):
-            return IntegrityReport((str(error),), False, checked)
+            return IntegrityReport((damage_words(error),), False, checked)
         # The time is over, or something passes: no free file descriptor, a locked file. The next check tells.
         if time.monotonic() < until:
             log.warning("store not checked", extra={"why": str(error)})

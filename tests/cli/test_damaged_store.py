@@ -1,6 +1,7 @@
 """Commands that read a damaged store say so in one sentence."""
 
 import os
+import re
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -129,3 +130,19 @@ def test_a_store_that_begins_on_an_empty_file_is_said_once(tmp_path: Path, caplo
     for _ in range(2):
         open_store(str(file)).close()
     assert caplog.messages.count("new store") == 1
+
+
+@pytest.mark.parametrize("command", [["servos"], ["audit", "ax-1"], ["replay", "ax-1"], ["backup", "b.db"]])
+def test_a_text_that_is_none_is_said_as_damage_without_its_bytes(tmp_path: Path, command: list[str]) -> None:
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    store = open_store(str(file))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    with closing(sqlite3.connect(file)) as writer:
+        writer.execute("UPDATE messages SET servo = CAST(x'61782d31ff' AS TEXT), encoding = CAST(x'ff' AS TEXT)")
+        writer.execute("UPDATE twins SET servo = CAST(x'61782d31ff' AS TEXT)")
+        writer.commit()
+    result = CliRunner().invoke(app, [*command, "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert re.match(r"error: store .*: is damaged \(a text in column '\w+' is not UTF-8\)", result.stderr)
+    assert result.stderr.count("\n") == 1

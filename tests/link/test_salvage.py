@@ -377,3 +377,15 @@ def test_a_corrupt_file_of_another_servo_is_put_aside_with_what_can_be_read_of_i
     assert (other.servo, other.waiting, broken.rescued + broken.lost) == ("axis-1", broken.rescued, WINDOWS)
     with closing(SqliteOutbox(other.file, "axis-1")) as aside:
         assert [aside.get(key) for key in aside.pending()] == [window(key[1]) for key in aside.pending()]
+
+
+def test_a_name_that_is_no_text_loses_its_own_window_only(tmp_path: Path) -> None:
+    path = filled(tmp_path, WINDOWS)
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("UPDATE windows SET boot = CAST(x'6230ff' AS TEXT) WHERE sequence = 5")
+        file.commit()
+    box = SqliteOutbox(path, "axis-1", last=LastStatus(WINDOWS))
+    assert box.flushed
+    assert [sequence for _, sequence in box.pending()] == [k for k in range(WINDOWS) if k != 5]
+    assert (box.salvages[0].file.name, box.dropped) == ("outbox.sqlite.broken-1", {BROKEN: 1})
+    box.close()
