@@ -32,7 +32,7 @@ class HttpAnswer(NamedTuple):
 class _PlainConnection(HTTPConnection):
     """A connection whose socket is known, and can be shut down, while it is still being connected."""
 
-    ended = False
+    ended, interrupted = False, False
 
     def connect(self) -> None:
         """Connect to the first address that accepts; raises OSError where none does."""
@@ -136,8 +136,9 @@ class PersistentConnection:
         try:
             return self._request_once(method, path, body, headers, limit)
         except (OSError, HTTPException, ValueError) as error:
-            self.drop()
             # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
+            fresh = fresh and not (self._connection is not None and self._connection.interrupted)
+            self.drop()
             if fresh or isinstance(error, TimeoutError):
                 encrypted = self._context is not None
                 raise Unreachable(cause_of(error, encrypted, self._ca_file, answered=self._answered)) from None
@@ -160,9 +161,10 @@ class PersistentConnection:
             raise
 
     def interrupt(self) -> None:
-        """Send the request that waits for a response, if one does, once more on a fresh connection, or have it fail."""
+        """Send the request that waits for a response, if one does, once more on a fresh connection."""
         connection = self._connection
         if connection is not None:
+            connection.interrupted = True
             connection.shut_down()
 
     def close(self) -> None:
