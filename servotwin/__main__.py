@@ -28,7 +28,7 @@ def main() -> None:
             # `exec` makes it forget.
             exec("")
         if output is not None:
-            end.code = output.exit_code(end.code)
+            end.code = output.exit_code(end.code, alone=len(sys.argv) < 2)
         raise
 
 

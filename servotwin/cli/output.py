@@ -6,7 +6,10 @@ import errno
 import io
 import sys
 from contextlib import suppress
-from typing import IO, Any, cast
+from typing import IO, TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 DIFFERENT, INVALID, CLOSED = 1, 2, 141
 """Exit codes: of a result that is not as wanted; of an error; of a closed pipe, as a shell shows SIGPIPE."""
@@ -49,12 +52,15 @@ class CheckedOutput:
             write_through=cast(Any, text).write_through,
         )
 
-    def exit_code(self, code: Any) -> Any:
-        """Write the last of the output; return the exit code, instead of the command's own where output was lost."""
+    def exit_code(self, code: Any, alone: bool = False) -> Any:
+        """Write the last of the output; return the exit code, instead of the command's own where output was lost.
+
+        `alone`: without a command, which is an error whose help is the output.
+        """
         with suppress(OSError):
             self._text.flush()
         error = self._file.error
-        if error is None or code not in (None, 0, DIFFERENT):  # an error of its own is said already
+        if error is None or not (alone or code in (None, 0, DIFFERENT)):  # an error of its own is said already
             return code
         if self._file.closed_pipe:
             return CLOSED
@@ -62,6 +68,14 @@ class CheckedOutput:
         with suppress(OSError):  # a full disk under both
             print(f"error: the output could not be written ({error.strerror}){done}", file=sys.stderr, flush=True)
         return INVALID
+
+
+def progress_bar() -> Progress:
+    """Progress that vanishes at its end; on a terminal only, since elsewhere it would leave an empty line."""
+    from rich import get_console
+    from rich.progress import Progress
+
+    return Progress(transient=True, disable=not get_console().is_terminal)
 
 
 def checked_output() -> CheckedOutput | None:

@@ -61,6 +61,12 @@ def test_output_on_a_full_disk_is_one_sentence_and_a_closed_pipe_none(unbuffered
         assert (closed.returncode, closed.stderr) == (141, "")
 
 
+def test_the_help_of_a_command_line_without_a_command_is_output_too() -> None:
+    full, closed = on_a_full_disk(["-m", "servotwin"]), into_a_closed_pipe(["-m", "servotwin"])
+    assert (full.returncode, full.stderr) == (2, SAID.replace("; everything else was done", ""))
+    assert (closed.returncode, closed.stderr) == (141, "")
+
+
 @pytest.mark.parametrize("words", [["servos"], ["audit", "ax-1", "--json"], ["twin", "check"]])
 def test_a_command_whose_output_is_lost_says_so(config: Path, words: list[str]) -> None:
     command = ["-m", "servotwin", *words, "--config", str(config)]
