@@ -6,18 +6,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rich.progress import Progress
-
+from servotwin.cli.output import progress_bar
+from servotwin.errors import InvalidInput
 from servotwin.store.backup import Progress as Report
-from servotwin.store.backup import RowCounts, backup, restore
+from servotwin.store.backup import RowCounts, backup, newest_of, restore
+from servotwin.twin_service.store_watch import lost_since
 from servotwin.twin_service.twin_file import service_of
 
 
 def backup_store(config: Path, to: Path, replace: bool) -> None:
-    """Copy the store of a twin's file to another file; raises InvalidInput as `store.backup.backup` does."""
+    """Copy the store of a twin's file to another file.
+
+    Raises
+    ------
+    InvalidInput
+        As `store.backup.backup`; or the store has lost messages: the copy of it is made, but replaces no earlier one.
+    """
+    store = service_of(config).store
+    lost = lost_since(store, newest_of(store, to))
+    if lost and replace and to.exists():
+        raise InvalidInput(
+            f"backup {to}: is not replaced, because the store has lost messages ({lost}); give another file"
+        )
     with _progress("copying") as report:
-        counts = backup(service_of(config).store, to, report, replace)
+        counts = backup(store, to, report, replace)
     _print_counts(to, counts)
+    if lost:
+        raise InvalidInput(f"backup {to}: is written, but its store has lost messages ({lost}); keep the earlier ones")
 
 
 def restore_store(config: Path, backed_up: Path) -> None:
@@ -30,7 +45,7 @@ def restore_store(config: Path, backed_up: Path) -> None:
 
 @contextmanager
 def _progress(description: str) -> Iterator[Report]:
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         task = progress.add_task(description, total=None)
 
         def report(left: int, total: int) -> None:

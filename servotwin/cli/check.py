@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from rich.progress import Progress
-
+from servotwin.cli.output import progress_bar
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import POSTGRESQL, SQLITE, StoreUnavailable
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
@@ -80,7 +79,7 @@ def _require_whole(store: Store, config: Path, seconds: float) -> None:
 def _check_bodies(store: Store) -> int:
     """Compare all bodies; returns their number."""
     after, checked, complete = 0, 0, False
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("comparing", total=newest_message(store))
         while not complete:
             result, after = check_bodies(store, after, _BODIES)

@@ -68,16 +68,22 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
     InvalidInput
         There is no store, it is damaged or in PostgreSQL, or the file exists or cannot be written.
     """
-    source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
-    check_named(source, "store ")
-    if not source.is_file():
-        raise InvalidInput(f"store {source}: there is no such file; give that of a store")
+    source = _existing(url, to)
     if to.exists() and to.samefile(source):
         raise InvalidInput(f"backup {to}: is the store itself; give another file")
     if to.exists() and not replace:
         raise InvalidInput(f"backup {to}: exists already; give another file, or --replace to replace it")
     with atomic_output(to, PRIVATE) as temporary:
         return _copied(source, temporary, to, progress)
+
+
+def newest_of(url: str, to: Path) -> int:
+    """Id of the newest message of a store that is to be copied to a file; raises InvalidInput as `backup` does."""
+    source = _existing(url, to)
+    with _opened(source, "mode=ro") as store:
+        _check_revision(store, source)
+        (newest,) = store.execute("SELECT coalesce(max(id), 0) FROM messages").fetchone()
+        return int(newest)
 
 
 def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowCounts:
@@ -116,6 +122,15 @@ def _ask_for_windows(store: sqlite3.Connection) -> None:
         for servo, serial in store.execute("SELECT servo, posted FROM twins").fetchall()
     ]
     store.executemany("INSERT INTO outgoing (servo, serial, body, created) VALUES (?, ?, ?, ?)", rows)
+
+
+def _existing(url: str, to: Path) -> Path:
+    """File of the store that is to be copied."""
+    source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
+    check_named(source, "store ")
+    if not source.is_file():
+        raise InvalidInput(f"store {source}: there is no such file; give that of a store")
+    return source
 
 
 def _source_file(url: str, command: str, file: Path) -> Path:

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
-from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, sqlite_file
+from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.integrity import (
     IntegrityReport,
     check_all,
@@ -319,6 +319,12 @@ def lost_messages(store: Store, beside: Path) -> str:
     return _loss(_read_mark(_mark_file(store, beside)), newest_message(store))
 
 
+def lost_since(url: str, newest: int) -> str:
+    """Messages that an SQLite store had once, where its newest one now is `newest`; empty: none."""
+    file = sqlite_file(parse_address(url))
+    return "" if file is None else _loss(_read_mark(_beside(file)), newest)
+
+
 def _loss(had: int, has: int) -> str:
     return f"its newest message is number {has}, and it once had number {had}" if has < had else ""
 
@@ -327,7 +333,11 @@ def _mark_file(store: Store, beside: Path) -> Path | None:
     """File with the number of the newest message; None: the store is in memory."""
     shared = store.engines.writer.dialect.name == POSTGRESQL
     file = beside if shared else sqlite_file(store.engines.writer.url)
-    return None if file is None else file.with_name(f"{file.name}-{_MARK}")
+    return None if file is None else _beside(file)
+
+
+def _beside(file: Path) -> Path:
+    return file.with_name(f"{file.name}-{_MARK}")
 
 
 def _read_mark(file: Path | None) -> int:

@@ -146,3 +146,33 @@ def test_a_text_that_is_none_is_said_as_damage_without_its_bytes(tmp_path: Path,
     assert result.exit_code == INVALID
     assert re.match(r"error: store .*: is damaged \(a text in column '\w+' is not UTF-8\)", result.stderr)
     assert result.stderr.count("\n") == 1
+
+
+def test_output_that_is_no_terminal_has_no_empty_line_for_the_progress(tmp_path: Path) -> None:
+    config = twin_file(tmp_path)
+    store = open_store(str(tmp_path / "twin.db"))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    (tmp_path / "other").mkdir()
+    copy, other = str(tmp_path / "b.db"), twin_file(tmp_path / "other")
+    for command, file in ((["twin", "check"], config), (["backup", copy], config), (["restore", copy], other)):
+        result = CliRunner().invoke(app, [*command, "--config", str(file)])
+        assert (result.exit_code, result.stdout.count("\n")) == (0, 1), result.stdout
+
+
+def test_a_backup_of_a_store_that_has_lost_messages_says_so_and_replaces_none(tmp_path: Path) -> None:
+    config, copy = twin_file(tmp_path), tmp_path / "b.db"
+    store = open_store(str(tmp_path / "twin.db"))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    (tmp_path / "twin.db-newest").write_text("9\n")
+    lost = "has lost messages (its newest message is number 4, and it once had number 9)"
+    command = ["backup", str(copy), "--replace", "--config", str(config)]
+    result = CliRunner().invoke(app, command)
+    assert (result.exit_code, "4 messages" in result.stdout) == (INVALID, True)
+    assert result.stderr == f"error: backup {copy}: is written, but its store {lost}; keep the earlier ones\n"
+    written = copy.stat()
+    result = CliRunner().invoke(app, command)
+    assert (result.exit_code, result.stdout) == (INVALID, "")
+    assert result.stderr == f"error: backup {copy}: is not replaced, because the store {lost}; give another file\n"
+    assert (copy.stat().st_ino, copy.stat().st_mtime_ns) == (written.st_ino, written.st_mtime_ns)
