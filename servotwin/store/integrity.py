@@ -239,7 +239,7 @@ def body_fault(message: int, servo: str, encoding: str, digest: bytes, body: byt
         return ""
     try:
         sound = message_digest(decompress(body, encoding, MAX_BYTES)) == digest
-    except InvalidMessage:
+    except (InvalidMessage, TypeError):  # SQLite keeps a text where a body belongs
         sound = False
     return "" if sound else f"message {message} of servo {servo!r}: its body differs from its digest"
 

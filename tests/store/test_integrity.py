@@ -14,6 +14,7 @@ from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable, sqlite_file
 from servotwin.store.integrity import (
     IntegrityReport,
+    body_fault,
     check_all,
     check_bodies,
     check_pages,
@@ -94,6 +95,15 @@ def test_a_body_that_changed_is_found_by_its_digest(store: Store, changed: bytes
     store.put([digested(0, b"earlier"), whole._replace(body=changed)])
     result, _ = check_bodies(store, 0, 10)
     assert result.faults == (f"message {newest_message(store)} of servo 'a': its body differs from its digest",)
+
+
+@pytest.mark.parametrize("column", ["body", "digest", "encoding"])
+def test_a_column_that_became_of_another_type_is_damage(column: str) -> None:
+    """One bit in the header of a row tells a text from bytes of the same length."""
+    row = {"body": b"samples", "digest": message_digest(b"samples"), "encoding": ""}
+    assert body_fault(1, "a", **row) == ""
+    other = {"body": "samples", "digest": row["digest"].hex()[:16], "encoding": b"deflate"}[column]
+    assert body_fault(1, "a", **{**row, column: other}) == "message 1 of servo 'a': its body differs from its digest"
 
 
 def test_a_check_ends_in_time_and_says_so(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
