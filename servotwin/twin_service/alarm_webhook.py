@@ -9,14 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict, deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from enum import StrEnum
 from functools import partial
-from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.runtime.retry import Backoff, Retry
-from servotwin.store.records import WorkResult
+from servotwin.store.records import Lease, WorkResult
 from servotwin.twin_service.evidence_lines import ALARMS, log_kind
 from servotwin.twin_service.monitoring import Counter
 from servotwin.twin_service.webhook import (
@@ -37,7 +36,6 @@ _WAITING, _KNOWN = 1000, 10_000
 _RETRY = Retry(2.0, 2.0, 300.0)
 OF_ALL = "twin"
 """Stands for a machine's name in alarms of the twin itself."""
-_Commit = Callable[[WorkResult], Coroutine[Any, Any, bool]]
 
 
 class PostOutcome(StrEnum):
@@ -81,12 +79,14 @@ class AlarmWebhook:
         """Number of alarms that wait."""
         return len(self._waiting)
 
-    def note(self, result: WorkResult) -> None:
-        """Queue the alarms of a committed result."""
+    def note(self, lease: Lease, result: WorkResult) -> None:
+        """Queue the alarms of a lease's result, once it is committed."""
+        received = {message.id: message.received for message in lease.messages}
         for record in result.evidence:
             kind = log_kind(record)
             if kind in ALARMS:
-                self._queue(alarm_post(result.servo, kind, record.status, self._wall(), record.version))
+                came = received.get(record.message)
+                self._queue(alarm_post(result.servo, kind, record.status, self._wall(), record.version, came))
 
     def announce(self, kind: str, sentence: str, servo: str = OF_ALL) -> None:
         """Queue an alarm of the twin itself, which concerns one machine or all."""
@@ -142,15 +142,3 @@ class AlarmWebhook:
 
     def _end(self, outcome: PostOutcome) -> None:
         self._counter.add(outcome.value)
-
-
-def announced(commit: _Commit, webhook: AlarmWebhook) -> _Commit:
-    """A commit of results after which their alarms are posted."""
-
-    async def committed(result: WorkResult) -> bool:
-        valid = await commit(result)
-        if valid:
-            webhook.note(result)
-        return valid
-
-    return committed

@@ -62,6 +62,8 @@ class Dispatcher:
     updates : UpdatePace, optional
     paused : callable
         True while nothing new is to be begun.
+    note : callable
+        Called with each lease and its result, once that is committed.
     speed : float
         Least ratio of sample time to real time.
 
@@ -86,10 +88,11 @@ class Dispatcher:
         updates: UpdatePace | None = None,
         speed: float = 1.0,
         paused: Callable[[], bool] = lambda: False,
+        note: Callable[[Lease, WorkResult], None] = lambda *_: None,
     ) -> None:
         self._store, self._executor, self._pool = store, executor, pool
         self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
-        self._owner, self._quota = owner, quota
+        self._owner, self._quota, self._note = owner, quota, note
         self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
         self._updates, self._estimates = updates or UpdatePace(lambda _servo: None, clocks), EstimateShare()
         self._deferred, self._next_job = set[str](), 0.0
@@ -366,6 +369,7 @@ class Dispatcher:
                 self._metrics.age.observe(max(0.0, now - message.received))
         count_evidence(self._metrics, result)
         write_evidence(log, lease, result, seconds)
+        self._note(lease, result)
 
 
 _Queue = tuple[str, str]

@@ -18,7 +18,7 @@ from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupComm
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
+from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.backlog_pace import BacklogPace
 from servotwin.twin_service.claims import EdgeClaims
@@ -159,7 +159,7 @@ class TwinService:
             store=self.store,
             executor=self.executor,
             pool=self.pool,
-            commit=self.watch.commit if self.webhook is None else announced(self.watch.commit, self.webhook),
+            commit=self.watch.commit,
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
@@ -169,6 +169,7 @@ class TwinService:
             updates=UpdatePace(model_of, self.clocks),
             speed=min(1.0, config.speed),
             paused=lambda: bool(self.watch.fault),
+            note=(lambda *_: None) if self.webhook is None else self.webhook.note,
         )
 
     def _make_claims(self) -> EdgeClaims:

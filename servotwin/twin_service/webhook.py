@@ -108,7 +108,19 @@ def webhook_table(
 
 
 class AlarmPost(msgspec.Struct, frozen=True):
-    """Body of a post; `text`: the same as one sentence, for services that show only that."""
+    """Body of a post.
+
+    Attributes
+    ----------
+    text : str
+        The same as one sentence, for services that show only that.
+    servo, kind, sentence : str
+    time : str
+        When the twin raised the alarm.
+    version : int or None
+    received : str or None
+        When the message came that led to it, under load long before.
+    """
 
     text: str
     servo: str
@@ -116,13 +128,20 @@ class AlarmPost(msgspec.Struct, frozen=True):
     sentence: str
     time: str
     version: int | None = None
+    received: str | None = None
 
 
-def alarm_post(servo: str, kind: str, sentence: str, now: float, version: int | None = None) -> AlarmPost:
-    """Compose a post; `now`: s since the epoch."""
-    time = datetime.fromtimestamp(now, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+def alarm_post(
+    servo: str, kind: str, sentence: str, now: float, version: int | None = None, received: float | None = None
+) -> AlarmPost:
+    """Compose a post; `now` and `received`: s since the epoch."""
     words = sentence if sentence.startswith(kind) else f"{kind}: {sentence}"
-    return AlarmPost(f"{servo}: {words}", servo, kind, sentence, time, version)
+    came = None if received is None else _utc(received)
+    return AlarmPost(f"{servo}: {words}", servo, kind, sentence, _utc(now), version, came)
+
+
+def _utc(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def send_post(config: WebhookConfig, post: AlarmPost) -> int:

@@ -16,10 +16,10 @@ from service_system import ENGINEER, MSGPACK, OPERATOR, bearer, place, served, t
 from servotwin.cli.alarm_test import post_test_alarm
 from servotwin.errors import InvalidInput
 from servotwin.messages import EdgeClaim, encode
-from servotwin.store.records import Backlog, EvidenceRecord, WorkResult
+from servotwin.store.records import Backlog, EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.store.store import open_store
 from servotwin.twin_service import alarm_webhook, missing_windows, service
-from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
+from servotwin.twin_service.alarm_webhook import AlarmWebhook
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin, service_of
@@ -134,6 +134,9 @@ def test_a_repr_shows_neither_path_nor_secret():
     assert "hidden" not in repr(WebhookConfig("https://plant.example/hidden", "hidden"))
 
 
+LEASE = Lease("ax-1", b"", 1, (StoredMessage(7, MessageKind.LETTER, b"", "", 86400.0),))
+
+
 def result(*evidence, servo="ax-1"):
     return WorkResult(servo, 1, b"", None, (), tuple(evidence))
 
@@ -182,7 +185,7 @@ def run_webhook(monkeypatch, answers, results, repeat=3600.0):
     async def body():
         webhook = AlarmWebhook(WebhookConfig("https://a/", repeat=repeat), metrics.webhook, clock, clock, send)
         for each in results:
-            webhook.note(each)
+            webhook.note(LEASE, each)
         await until_quiet(webhook)
 
     asyncio.run(body())
@@ -231,22 +234,23 @@ def test_a_flood_drops_the_oldest(monkeypatch):
     assert counts == {"taken": 1000, "refused": 0, "dropped": 5}
 
 
-def test_a_result_that_is_void_announces_nothing(monkeypatch):
-    clock = Clock(monkeypatch)
+def test_an_alarm_says_when_it_was_raised_and_when_the_message_came_that_led_to_it(monkeypatch):
+    posted = []
 
     async def body():
-        webhook = AlarmWebhook(WebhookConfig("https://a/"), Metrics().webhook, clock, clock)
+        def send(_config, post):
+            posted.append(post)
 
-        async def commit(each):
-            return each.servo == "ax-1"
-
-        committed = announced(commit, webhook)
-        assert not await committed(result(alarm("one"), servo="ax-2"))
-        assert webhook.waiting == 0
-        assert await committed(result(alarm("one")))
-        assert webhook.waiting == 1
+        webhook = AlarmWebhook(
+            WebhookConfig("https://a/"), Metrics().webhook, lambda: 90000.0, Clock(monkeypatch), send
+        )
+        webhook.note(LEASE, result(alarm("one")._replace(message=7), alarm("two")))
+        webhook.announce("updates lag", "late")
+        await until_quiet(webhook)
 
     asyncio.run(body())
+    assert [post.time for post in posted] == ["1970-01-02T01:00:00Z"] * 3
+    assert [post.received for post in posted] == ["1970-01-02T00:00:00Z", None, None]
 
 
 def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch, caplog):

@@ -32,6 +32,7 @@ class Lender:
         self.leased: list[tuple[float, bool]] = []
         self.seen: list[tuple[str, int]] = []
         self.released: list[frozenset[str]] = []
+        self.noted: list[tuple[str, str]] = []
         self.renewed: list[frozenset[str]] = []
         self.held: list[str] = []
         self.expected: list[float] = []
@@ -109,6 +110,7 @@ def through(
             owner="me",
             quota=quota or VerificationQuota(0.0),
             pace=pace or WorkPace(0.5),
+            note=lambda lease, result: lender.noted.append((lease.servo, result.servo)),
         )
 
         async def one_by_one() -> "Lender":
@@ -163,6 +165,12 @@ def test_an_estimate_comes_before_the_next_job_of_new_messages(monkeypatch):
     estimate = claim("a")._replace(estimate=True)
     leased = through([[claim("a", DEFERS)], [estimate]]).leased
     assert [first for _, first in leased] == [False, True]
+
+
+def test_a_result_is_noted_once_it_is_committed_and_a_void_one_never():
+    turns = [[claim("a")], [claim("b", FAILS)]]
+    assert through(turns).noted == [("a", "a")]
+    assert through(turns, valid=False).noted == []
 
 
 def test_a_void_result_releases_no_lease():
