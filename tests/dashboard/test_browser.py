@@ -255,3 +255,14 @@ def test_numbers_are_readable_and_long_windows_complete(open_page):
         { name: "m", windowNote: document.createElement("p") }, window, "b", 1))"""
     shown = {"samples": samples, "rate": rate, "channels": [{"name": "position", "time": [], "values": []}]}
     assert page.evaluate(whole, shown)["channels"][0]["values"] == list(range(samples))
+
+
+def test_what_works_at_the_twin_but_not_as_it_should_is_said_on_every_page(open_page):
+    page, said = open_page(), ["updates lag by 40 s", "<b>certificate</b> twin.crt expires"]
+    assert page.locator("#degraded").is_hidden()
+    page.route("**/healthz", lambda route: route.fulfill(json={"degraded": said}))
+    page.reload()
+    has_text(page, "#degraded", "The twin says: updates lag by 40 s; <b>certificate</b> twin.crt expires.")
+    open_machine(page, WEARING)
+    has_text(page, "#degraded", "updates lag by 40 s")
+    assert serious_faults(page) == []

@@ -90,6 +90,7 @@ export const channels = (name, boot, sequence, points, from = null, to = null) =
   request(`${windowPath(name, boot, sequence)}/channels?points=${points}${from === null ? "" : `&from=${from}&to=${to}`}`);
 export const live = (name, boot, after) => request(`${servo(name)}/live?boot=${boot}&after=${after}`);
 export const residual = (name, boot, sequence) => request(`${windowPath(name, boot, sequence)}/residual`, { signal: AbortSignal.timeout(60000), detailed: true });
+export const health = () => request("/healthz");
 export const webhook = () => request("/v1/webhook");
 export const testWebhook = () => request("/v1/webhook/test", { method: "POST", detailed: true });
 export const oversight = (name) => request(`${servo(name)}/acts`);

@@ -9,6 +9,7 @@ import { MachinePage } from "./machine.js";
 
 const byId = (id) => document.getElementById(id);
 const THEMES = ["auto", "light", "dark"];
+const HEALTH_MS = 15000;
 let page = null;
 
 const live = new Live(
@@ -33,6 +34,18 @@ function showState() {
   };
   const kept = live.since === null ? "" : ` What is shown is of ${clock(live.since)}${live.state === "ended" ? "" : "; trying again"}.`;
   byId("state").textContent = words[live.state] + (live.state === "live" ? "" : kept);
+}
+
+// What works at the twin, but not as it should: a lag, a clock, a certificate that expires.
+async function showDegraded() {
+  if (document.hidden || live.state !== "live") return;
+  try {
+    const { degraded } = await api.health();
+    byId("degraded").textContent = degraded.length ? `The twin says: ${degraded.join("; ")}.` : "";
+    byId("degraded").hidden = degraded.length === 0;
+  } catch {
+    // the state of the page says what is wrong
+  }
 }
 
 function askToken(why) {
@@ -68,6 +81,7 @@ async function begin() {
   byId("logout").hidden = !tokens;
   await live.start();
   if (!page) show();
+  showDegraded();
 }
 
 function show() {
@@ -124,6 +138,7 @@ function start() {
     (byId("login").hidden ? byId("view") : byId("token")).focus();
   });
   showState();
+  setInterval(showDegraded, HEALTH_MS);
   firstTime();
 }
 
