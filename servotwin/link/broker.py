@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
+from servotwin.link.transport import Unreachable
 from servotwin.link.url import read_again, tls_context
 from servotwin.runtime.extras import missing_extra
 
@@ -153,6 +154,7 @@ class Connection:
     def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
         self._session, self._events = session, events
         self._number, self._fresh, self._up, self._answered, self._closing = 0, True, False, False, False
+        self._largest = 0
         self._broker, self._context = broker, tls_context(broker.ca_file) if broker.tls else None
         self._hint = "" if broker.tls else ": where its port is one with TLS, url begins with mqtts://"
         self._client = _client(broker, session, self._context)
@@ -167,7 +169,18 @@ class Connection:
         self._client.loop_start()
 
     def publish(self, topic: str, payload: bytes, expiry_s: float) -> int | None:
-        """Send at least once, within `expiry_s`; return the message's number, None where too many wait already."""
+        """Send at least once, within `expiry_s`; return the message's number, None where too many wait already.
+
+        Raises
+        ------
+        Unreachable
+            It is larger than what the broker takes, which would end the connection.
+        """
+        size, most = len(payload) + len(topic.encode()) + _OVERHEAD, self._largest
+        if 0 < most < size:
+            raise Unreachable(
+                f"the broker takes packets of {most} bytes at most, and this message has {size}: raise its limit"
+            )
         properties = _properties("PUBLISH", MessageExpiryInterval=max(1, round(expiry_s)))
         info = self._client.publish(topic, payload, qos=1, properties=properties)
         return info.mid if info.rc in (0, _NO_CONNECTION) else None
@@ -187,12 +200,13 @@ class Connection:
         timer.cancel()
         timer.join()
 
-    def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, _properties: Any) -> None:
+    def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, answer: Any) -> None:
         self._answered = True
         if reason.is_failure:
             self._events.lost(f"the broker refuses the connection ({reason})")
             return
         self._number, self._up = self._number + 1, True
+        self._largest = getattr(answer, "MaximumPacketSize", 0)
         self._fresh = not flags.session_present
         client.subscribe([(topic, _at_least_once()) for topic in self._session.topics])
 
@@ -240,6 +254,8 @@ class Connection:
         self._events.message(message.topic, bytes(message.payload), acknowledge)
 
 
+_OVERHEAD = 64
+"""Bytes of a packet beside topic and payload, at most; about 20 are usual."""
 _NO_SUBSCRIBERS = 0x10
 """MQTT's reason code "no matching subscribers"."""
 _SILENT = 0x8D

@@ -95,7 +95,7 @@ class MqttTransport:
         self._waiting: dict[int, _Copy] = {}
         self._published: dict[int, _Answer] = {}
         self._sending, self._not_delivered = 0, dict[int, str]()
-        self._round_trip, self._unanswered = RoundTrip(timeout_s), 0
+        self._round_trip, self._unanswered, self._losses = RoundTrip(timeout_s), 0, 0
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
         session = MqttSession(name, (response_topic(servo), TWIN_GONE), session_s)
@@ -169,7 +169,7 @@ class MqttTransport:
     def _answer(self, request: MqttRequest, future: _Answer, wait: float) -> MqttResponse | UnknownPeer:
         """Send a request, and again after one round trip without an answer, two more, four ...; any answer counts."""
         patience, pause = wait + self._timeout, self._round_trip.wait_s
-        until, copies = time.monotonic() + patience, 0
+        until, copies, losses = time.monotonic() + patience, 0, self._losses
         while (left := until - time.monotonic()) > 0.0:
             if copies == 0 or self._ready.is_set():  # what is on its way is sent again once there is a connection
                 self._send(request, future, left, measured=wait == 0.0)
@@ -178,7 +178,8 @@ class MqttTransport:
                 return future.result(min(left, wait + pause))
             self._missed()
             pause *= 2.0
-        raise Unreachable(f"no answer of a twin within {patience:g} s")
+        meanwhile = f": {self._why}" if self._losses > losses else ""
+        raise Unreachable(f"no answer of a twin within {patience:g} s{meanwhile}")
 
     def _missed(self) -> None:
         """Note that a copy of a request was not answered; make the connection anew after a number of them."""
@@ -254,7 +255,7 @@ class MqttTransport:
 
     def _lost(self, why: str) -> None:
         """Keep the requests under way: broker and edge go on with them when the connection is restored."""
-        self._why = why
+        self._why, self._losses = why, self._losses + 1
         with self._lock:  # their answers will tell how long the connection was away
             self._waiting = {serial: copy._replace(measured=False) for serial, copy in self._waiting.items()}
         if not self._closed:

@@ -29,6 +29,7 @@ from servotwin.link.mqtt_messages import (
     servo_of,
 )
 from servotwin.link.seal import key_of
+from servotwin.link.transport import Unreachable
 from servotwin.messages import InvalidMessage, Refusal
 from servotwin.store.records import MessageKind, PutResult
 from servotwin.twin_service.auth import EdgeGate
@@ -267,8 +268,11 @@ class MqttServer:
             acknowledge()
         if answer.data is None or (answer.refused and not await self._has_held_back(answer.refused)):
             return
-        if connection.publish(response_topic(servo), answer.data, _RESPONSE_EXPIRY_S) is None:
-            log.warning("response not sent: too much waits for the broker", extra={"servo": servo})
+        try:
+            if connection.publish(response_topic(servo), answer.data, _RESPONSE_EXPIRY_S) is None:
+                log.warning("response not sent: too much waits for the broker", extra={"servo": servo})
+        except Unreachable as error:
+            self._on_refused(str(error))
 
     async def _has_held_back(self, sender: str) -> bool:
         """Hold an answer back; False: too many are held back already.

@@ -29,7 +29,14 @@ class Tls(NamedTuple):
 class Mosquitto:
     """A broker in a folder."""
 
-    def __init__(self, folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None, rules: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        logins: tuple[Login, ...] = (),
+        tls: Tls | None = None,
+        rules: str = "",
+        settings: tuple[str, ...] = (),
+    ) -> None:
         self.program, self.folder, self.port = needed("mosquitto"), folder, free_port()
         self.scheme = "mqtt" if tls is None else "mqtts"
         self.process: subprocess.Popen[bytes] | None = None
@@ -40,6 +47,7 @@ class Mosquitto:
             "set_tcp_nodelay true",
             "max_inflight_messages 1000",
             "max_queued_messages 100000",
+            *settings,
         ]
         if logins:
             lines.append(f"password_file {self._passwords(logins)}")
@@ -92,11 +100,15 @@ def free_port() -> int:
 
 @contextmanager
 def broker(
-    folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None, rules: str = ""
+    folder: Path,
+    logins: tuple[Login, ...] = (),
+    tls: Tls | None = None,
+    rules: str = "",
+    settings: tuple[str, ...] = (),
 ) -> Iterator[Mosquitto]:
-    """One that runs; `rules` say who may do what."""
+    """One that runs; `rules` say who may do what, `settings` are further lines of its file."""
     folder.mkdir(exist_ok=True)
-    made = Mosquitto(folder, logins, tls, rules)
+    made = Mosquitto(folder, logins, tls, rules, settings)
     made.start()
     try:
         yield made
