@@ -11,12 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from servotwin.drives import table
 from servotwin.edge.drive import Drive, DriveLost
 from servotwin.edge.recorder import Recorder
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.control import ControlRole
+from servotwin.edge_process.drive import drive_of
 from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.link_child import LinkChild, link_command
 from servotwin.edge_process.monitoring import TroubleLog, log
@@ -69,7 +69,7 @@ def run(path: str | os.PathLike[str]) -> None:
     """
     config, file = load(path), Path(path).resolve()
     check(config)
-    drive = _drive_of(config, file)  # before a file is made, for what its table names may be wrong
+    drive = drive_of(config, file)  # before a file is made, for what its table names may be wrong
     with exclusive(config):
         _run(config, file, drive)
 
@@ -98,16 +98,6 @@ def _run(config: EdgeConfig, path: Path, drive: Drive) -> None:
         for each, handler in before.items():
             signal.signal(each, handler)
         log("end", windows_left_behind=outlet.untaken)
-
-
-def _drive_of(config: EdgeConfig, path: Path) -> Drive:
-    """Make the drive of the edge's file, not connected yet; refuse probing moves that it cannot make."""
-    if config.role == "control":
-        return table.control_drive(config.drive_table, config.folder)
-    drive = table.supervised_drive(config.drive_table, config.folder, config.agent.motor_encoder)
-    if config.agent.probe is not None and not drive.can_move:
-        raise InvalidInput(f"{path}: edge.probe: this drive cannot move its reference; leave the table out")
-    return drive
 
 
 def _shared_samples(config: EdgeConfig) -> SampleMemory | None:

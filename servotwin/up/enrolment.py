@@ -18,6 +18,7 @@ from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 from servotwin.edge_process.config import ROLES, UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml, load
+from servotwin.edge_process.drive import check_drive
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN
@@ -146,8 +147,8 @@ class Enroller:
         Raises
         ------
         InvalidInput
-            The servo has no model, it or its folder has a token already, or no setting is verified for its stated
-            range.
+            The servo has no model, it or its folder has a token already, its drive cannot be what is stated, or no
+            setting is verified for its stated range.
         """
         _check(request, known)
         return "" if (request.folder / CONFIG).exists() else made or edge_toml(self._config(request))
@@ -165,7 +166,9 @@ class Enroller:
         if key not in self._configs:
             self._configs[key] = _edge_config(self._twin, model, request, self._trusted(request))
         config = self._configs[key]
-        return replace(config, agent=replace(config.agent, servo=request.servo), folder=request.folder)
+        config = replace(config, agent=replace(config.agent, servo=request.servo), folder=request.folder)
+        check_drive(replace(config, source=str(config.folder / CONFIG)))
+        return config
 
     def _trusted(self, request: Enrolment) -> Path | None:
         if request.ca not in self._certificates:

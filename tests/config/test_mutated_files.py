@@ -15,7 +15,7 @@ from edge_files import edge_file
 from servotwin.config.toml import dumps
 from servotwin.edge.agent import Agent
 from servotwin.edge_process.config_file import load
-from servotwin.edge_process.run import _drive_of
+from servotwin.edge_process.drive import drive_of
 from servotwin.edge_process.startup import check
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import parse_address, sqlite_file
@@ -89,7 +89,7 @@ def run_edge(path: Path) -> None:
     """As at the start of an edge, and some samples."""
     config = load(path)
     check(config)
-    _drive_of(config, path).close()
+    drive_of(config, path).close()
     agent = Agent(replace(config.agent, boot="b0"))
     agent.absorb_block(*(array("d", [value] * 100) for value in (1e-3, 0.0, 0.0, 0.0)))
 

@@ -57,6 +57,28 @@ def test_the_edge_ticks_a_cascade_at_the_rate_of_its_samples(tmp_path: Path) -> 
     assert config.controller == Axis.preset("two-mass-drive").controller.replace(sample_rate=1000.0)
 
 
+def test_a_log_to_replay_must_be_where_the_edge_will_look_for_it(tmp_path: Path) -> None:
+    drive = {"kind": "replay", "log": "run.csv"}
+    with pytest.raises(InvalidInput, match=r"edge/edge\.toml: drive\.log = 'run\.csv': .*run\.csv: cannot be read"):
+        enrolled(tmp_path, "two-mass-drive", drive=drive)
+    assert {path.name for path in tmp_path.iterdir()} <= {"twin.toml", "tokens.toml-lock"}
+    (tmp_path / "edge").mkdir()
+    (tmp_path / "edge" / "run.csv").write_text("time_s,reference_rad,theta_m_rad,position_rad,command_n_m\n0,0,0,0,0\n")
+    assert enrolled(tmp_path, "two-mass-drive", drive=drive).drive == drive
+
+
+@pytest.mark.parametrize(("role", "kind"), [("supervise", "replya"), ("control", "replay")])
+def test_a_kind_of_drive_that_the_role_does_not_have_is_refused(tmp_path: Path, role: str, kind: str) -> None:
+    with pytest.raises(InvalidInput, match=f"drive.kind = '{kind}' is not allowed"):
+        enrolled(tmp_path, "two-mass-drive", drive={"kind": kind, "log": "run.csv"}, role=role)
+    assert not (tmp_path / "edge").exists()
+
+
+def test_files_of_an_opc_ua_drive_are_looked_for_where_the_edge_runs(tmp_path: Path) -> None:
+    drive = {"kind": "opcua", "url": "opc.tcp://plc", "certificate": "plc.der"}
+    assert enrolled(tmp_path, "two-mass-drive", drive=drive).drive == drive
+
+
 def test_an_edge_whose_rate_makes_the_loop_unstable_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="at 100 Hz is unstable on this axis even without a gap"):
         enrolled(tmp_path, "ball-screw", role="control", sample_rate=100.0)
