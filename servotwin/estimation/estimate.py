@@ -172,7 +172,8 @@ class GapEstimate:
     evaluations : int
         Evaluations of the cost.
     offset : OffsetReading or CarriedOffset, optional
-        The encoder's offset, read from this window or carried from earlier ones; None: not used.
+        The encoder's offset, read from this window or carried from earlier ones; None: not used. Of an estimate that is
+        not OK: a carried one that does not fit the window.
     machine : MachineReading, optional
         The machine's own numbers; None: the model was taken as it is.
     ratio : UnknownRatio, optional

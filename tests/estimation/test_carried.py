@@ -15,6 +15,7 @@ from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened import estimate_carrying, offset
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
@@ -151,12 +152,14 @@ def test_an_offset_that_is_too_uncertain_is_not_carried():
 
 
 def test_an_encoder_that_slipped_is_read_anew_or_doubted():
-    """A window with two contacts counts all the same. One that rests on the old offset is sure of a gap that is 6 deg
-    off: the trend refuses it, and ends the offset's use."""
-    trend = Trend.start(0.0, TrendSettings.for_wear(GAP, 1e5))
+    """A window with two contacts counts all the same. With the old offset, one contact would show a gap that is 6 deg
+    off: that is no estimate, and ends the offset's use."""
+    settings = TrendSettings.for_wear(GAP, 1e5)
+    trend, wear = Trend.start(0.0, settings), Wear(0.0)
     for k in range(3):
         window = noisy(stretch(5.0, 2.0), k)
-        trend = trend.update(replace(estimate_carrying(window, SERVO, None, SETTINGS, None), time=20.0 * k))
+        estimate = replace(estimate_carrying(window, SERVO, None, SETTINGS, None), time=20.0 * k)
+        trend, wear = trend.update(estimate), wear.update(settings, "boot", estimate, 20.0 * k)[0]
     slip = -3.0 * DEG
     both = estimate_carrying(noisy(stretch(5.0, 2.0), 5, slip), SERVO, None, SETTINGS, carried(trend))
     moved = trend.update(replace(both, time=60.0))
@@ -164,10 +167,23 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     assert "read anew" in moved.reasons[0]
     assert moved.prior.offset == pytest.approx(-slip, abs=0.02 * DEG)
     window = noisy(stretch(5.0, 1.2), 6, slip)
-    with_offset = estimate_carrying(window, SERVO, None, SETTINGS, carried(trend))
-    assert with_offset.ok
-    assert abs(with_offset.gap - GAP) > 5.0 * DEG
-    doubted = trend.update(replace(with_offset, time=60.0))
+    with_offset = estimate_carrying(window, SERVO, trend.as_estimate(), SETTINGS, carried(trend))
+    assert with_offset.status in REFUSED
+    assert "the gap would be 18 deg, and 12 deg are expected" in with_offset.reasons[-1]
+    assert wear.expect(settings, "boot", 60.0, 60.0).offset is not None
+    doubted, _ = wear.update(settings, "boot", replace(with_offset, time=60.0), 60.0)
+    assert doubted.expect(settings, "boot", 80.0, 80.0).offset is None
+    assert doubted.trend(settings).gap == pytest.approx(GAP, abs=0.1 * DEG)
+    right = estimate_carrying(noisy(stretch(5.0, 1.2), 6), SERVO, trend.as_estimate(), SETTINGS, carried(trend))
+    assert right.ok
+
+
+def test_a_gap_that_the_trend_refuses_ends_the_use_of_its_offset():
+    trend = Trend.start(0.0, TrendSettings.for_wear(GAP, 1e5))
+    first = GapEstimate(GAP, 1e-4, 1e-4, (GAP - 2e-4, GAP + 2e-4), GapStatus.OK, 0.0)
+    trend = trend.update(first, OffsetReading(0.0, 1e-4, 0.0))
+    wide = replace(first, gap=1.5 * GAP, time=20.0)
+    doubted = trend.update(wide, CarriedOffset(0.0, 1e-4, 2.0))
     assert doubted.refused == 1
     assert doubted.gap == pytest.approx(GAP, abs=0.1 * DEG)
     assert "forgotten" in doubted.reasons[1]

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from servotwin.estimation.estimate import GapEstimate, GapStatus, LastContact
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact
 from servotwin.estimation.learning.falls import Falls
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, updated
 from servotwin.estimation.learning.motor import LearntMotor, MotorLearning
@@ -335,11 +335,13 @@ class Wear(Struct, frozen=True):
     def _update_trend(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
         """Return the wear after an estimate, and the reason for which no update may follow from it; empty: it may.
 
-        An estimate that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the
-        reason in the trend's `reasons`, until others agree with it.
+        An estimate that is not OK, or older than the trend, moves nothing; one that does not fit the carried offset
+        ends its use. An outlier leaves the prediction, with the reason in the trend's `reasons`, until others agree
+        with it.
         """
         if not estimate.ok:
-            return self, f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
+            wear = self._without_offset(settings, boot) if isinstance(estimate.offset, CarriedOffset) else self
+            return wear, f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
         trend = self._on_clock(settings, boot, estimate.time, now)
         if self.state is not None and trend is not None and estimate.time <= trend.time:
             return self, "; ".join(self.state.reasons) or "the window is older than the trend"
@@ -349,6 +351,13 @@ class Wear(Struct, frozen=True):
         rejection = "" if counts else "; ".join(after.reasons) or "the window is older than the trend"
         after_state = TrendState.of(after)
         return replace(self, previous=previous, boot=boot, arrived=now, state=after_state), rejection
+
+    def _without_offset(self, settings: TrendSettings, boot: str) -> Wear:
+        """The wear without the encoder's offset of a boot."""
+        trend = self.trend(settings)
+        if trend is None or boot != self.boot:
+            return self
+        return replace(self, state=TrendState.of(trend.without_offset()))
 
     def _on_clock(self, settings: TrendSettings, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""

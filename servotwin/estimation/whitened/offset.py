@@ -18,6 +18,7 @@ from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, pol
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact, OffsetReading
+from servotwin.estimation.two_contacts import deg
 from servotwin.estimation.whitened.channels import motor_angle
 from servotwin.estimation.whitened.contact_pair import OneContact, Pair, pair
 from servotwin.estimation.whitened.estimator import WhitenedSettings, WindowFit, fit, fit_gap_only
@@ -31,6 +32,7 @@ _GAP, _CONSTANT = 0, 1  # rows of the columns
 # A right offset leaves about the same residual as none. Searches that got lost in its narrow valley stated gaps 1 deg
 # off with a small spread; their residual was a hundred times as large.
 _WORSE = 3.0
+_UNLIKE = 6.0  # standard deviations: a carried offset that moves the gap so far has changed, or is another machine's
 
 
 def estimate_carrying(
@@ -109,12 +111,30 @@ def _alone_or_aided(
     aided = fit(window, servo, prior, replace(settings, offset=carried), machine)
     helped = aided.concluded()
     agrees = paired is None or paired.agrees(helped)
-    if helped.ok and agrees and not helped.rms > _WORSE * fitted.rms():
-        slope = _slope(_columns(window, aided.servo, helped, settings))
-        return replace(helped, offset=CarriedOffset(*carried, slope))
+    fits = helped.ok and agrees and not helped.rms > _WORSE * fitted.rms()
+    expected = prior if isinstance(prior, GapEstimate) and fits and _is_unlike(helped, prior) else None
+    offset = CarriedOffset(*carried, _slope(_columns(window, aided.servo, helped, settings))) if fits else None
+    if fits and expected is None:
+        return replace(helped, offset=offset)
     if gap_only:
         fitted = fit(window, servo, prior, settings, machine, fitted)
-    return _refused(alone or fitted.concluded(), helped)
+    refused = _refused(alone or fitted.concluded(), helped)
+    return refused if expected is None or refused.ok else _doubting(refused, helped, expected, offset)
+
+
+def _is_unlike(helped: GapEstimate, expected: GapEstimate) -> bool:
+    """True for a gap that rests on a carried offset, and is surely not the one that is expected."""
+    return abs(helped.gap - expected.gap) > _UNLIKE * math.hypot(helped.std_total, expected.std_total)
+
+
+def _doubting(
+    alone: GapEstimate, helped: GapEstimate, expected: GapEstimate, offset: CarriedOffset | None
+) -> GapEstimate:
+    """The estimate of the window alone, with the offset that does not fit it: the trend forgets that."""
+    found, known = deg(helped.gap), deg(expected.gap)
+    why = f"with the encoder's offset from earlier windows the gap would be {found}, and {known} are expected"
+    forgotten = "that offset is not used until a window shows it again"
+    return replace(alone, offset=offset, reasons=(*alone.reasons, f"{why}: {forgotten}"))
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
