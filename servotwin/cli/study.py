@@ -172,7 +172,8 @@ def identify(
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """Estimate the gap from recordings of two encoders, or with a model of the machine (--servo, or the log's own)."""
-    from servotwin.cli.identify import IdentifyOptions, show
+    from servotwin.cli.identify import IdentifyOptions
+    from servotwin.cli.identify_report import show
     from servotwin.cli.lost_motion import show as show_lost_motion
     from servotwin.estimation.kinematic.travel import stated_travel
     from servotwin.logs.log import describes_its_machine
