@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -71,6 +71,8 @@ class Identification:
     windows : tuple of Window
     estimates : tuple of GapEstimate
         One for each window.
+    remarks : tuple of tuple of str
+        For each window, sentences on what it shows of the machine: a gap that has jumped or fallen, another machine.
     trend : Trend or None
         After the last window; None without an estimate that is OK.
     until_limit : Passage or None
@@ -80,6 +82,7 @@ class Identification:
     servo: Plant
     windows: tuple[Window, ...]
     estimates: tuple[GapEstimate, ...]
+    remarks: tuple[tuple[str, ...], ...]
     trend: Trend | None
     until_limit: Passage | None
 
@@ -104,30 +107,40 @@ def identify(options: IdentifyOptions, progress: Report = _silent) -> Identifica
     settings, windows = stated.on(servo), cut(log, options, servo)
     seen = _with_seen_load(servo, log.whole)
     if isinstance(servo, Axis) and options.wear_over_s is None:
-        estimates, trend = _followed_without_wear(log, windows, seen, settings, progress)
+        followed = _followed_without_wear(log, windows, seen, settings, progress)
     else:
-        estimates, trend = _followed(windows, seen, settings, progress)
+        followed = _followed(windows, seen, settings, progress)
+    trend = followed.trend
     until = None if settings.gap_limit is None or trend is None else trend.time_until(settings.gap_limit)
-    return Identification(servo, windows, estimates, trend, until)
+    return Identification(servo, windows, *followed, until)
 
 
-def _followed(
-    windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report
-) -> tuple[tuple[GapEstimate, ...], Trend | None]:
-    """Estimates of windows in the order of time, and the trend after the last one."""
+class _Followed(NamedTuple):
+    """Estimates of windows in the order of time, remarks on each, and the trend after the last one."""
+
+    estimates: tuple[GapEstimate, ...]
+    remarks: tuple[tuple[str, ...], ...]
+    trend: Trend | None
+
+
+def _followed(windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report) -> _Followed:
     wear, estimator = Wear(settings.initial_gap), estimator_of(seen, settings)
-    estimates = []
+    trends, learning = settings.trend, settings.learning
+    estimates, remarks = list[GapEstimate](), list[tuple[str, ...]]()
     for done, window in enumerate(windows):
         progress(done, len(windows))
-        now = window.mid_time
-        estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now, settings.learning)))
-        wear, _ = wear.update(settings.trend, "log", estimates[-1], now, settings.learning)
-    return tuple(estimates), wear.trend(settings.trend)
+        now, before = window.mid_time, wear
+        estimate = estimator(window, wear.expect(trends, "log", now, now, learning))
+        wear, rejection = wear.update(trends, "log", estimate, now, learning)
+        outlier = [rejection] if estimate.ok and rejection else []
+        estimates.append(estimate)
+        remarks.append((*outlier, *wear.remarks(before, estimate, trends, learning)))
+    return _Followed(tuple(estimates), tuple(remarks), wear.trend(trends))
 
 
 def _followed_without_wear(
     log: Log, windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report
-) -> tuple[tuple[GapEstimate, ...], Trend | None]:
+) -> _Followed:
     """The same of an axis of which nobody states the wear: it grows by what the log shows, and by itself in 40 windows.
 
     The wear decides which windows are accepted, and these show the wear: they are estimated again until both agree.
@@ -136,10 +149,10 @@ def _followed_without_wear(
     share = min(1.0, over / (_WEAR * windows[0].duration))
     trend = TrendSettings(rate_std_rad_per_s=0.0)
     while True:
-        estimates, found = _followed(windows, seen, replace(settings, trend=trend), progress)
-        shown = _growth([estimate for estimate in estimates if estimate.ok], share)
+        followed = _followed(windows, seen, replace(settings, trend=trend), progress)
+        shown = _growth([estimate for estimate in followed.estimates if estimate.ok], share)
         if shown <= 2.0 * growth:
-            return estimates, found
+            return followed
         growth = shown
         trend = TrendSettings.for_wear(growth, over)
 

@@ -30,7 +30,7 @@ def show(options: IdentifyOptions, as_json: bool) -> None:
         highlight=False,
     )
     console.print(_table(identification), highlight=False)
-    for line in _trend_lines(identification, options):
+    for line in (*_remarks(identification), *_trend_lines(identification, options)):
         console.print(line, highlight=False)
 
 
@@ -66,6 +66,11 @@ def _cells(estimate: GapEstimate) -> tuple[str, str]:
     return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-")
 
 
+def _remarks(identification: Identification) -> list[str]:
+    pairs = zip(identification.windows, identification.remarks, strict=True)
+    return [f"at {window.start:.2f} s: {remark}" for window, remarks in pairs for remark in remarks]
+
+
 def _trend_lines(identification: Identification, options: IdentifyOptions) -> list[str]:
     trend = identification.trend
     if trend is None:
@@ -94,12 +99,12 @@ def _trend_lines(identification: Identification, options: IdentifyOptions) -> li
 def as_dict(identification: Identification, options: IdentifyOptions) -> dict[str, Any]:
     """Make the JSON object: angles in deg, times in s, null where there is no number."""
     trend, until = identification.trend, identification.until_limit
-    pairs = zip(identification.windows, identification.estimates, strict=True)
+    rows = zip(identification.windows, identification.estimates, identification.remarks, strict=True)
     return {
         "log": str(options.log),
         "model": identification.servo.version,
         "method": options.method,
-        "windows": [_row(window, estimate) for window, estimate in pairs],
+        "windows": [_row(*row) for row in rows],
         "trend": None if trend is None else _finite(_trend(trend)),
         "until_limit": None
         if until is None
@@ -120,7 +125,7 @@ def _trend(trend: Trend) -> Mapping[str, Any]:
     }
 
 
-def _row(window: Window, estimate: GapEstimate) -> dict[str, Any]:
+def _row(window: Window, estimate: GapEstimate, remarks: tuple[str, ...]) -> dict[str, Any]:
     row = {
         "start_s": window.start,
         "duration_s": window.duration,
@@ -130,7 +135,8 @@ def _row(window: Window, estimate: GapEstimate) -> dict[str, Any]:
         "std_total_deg": math.degrees(estimate.std_total),
         "interval_deg": [math.degrees(x) for x in estimate.interval],
     }
-    return {**_finite(row), "status": estimate.status.value, "reasons": list(estimate.reasons)}
+    words = {"status": estimate.status.value, "reasons": list(estimate.reasons), "remarks": list(remarks)}
+    return {**_finite(row), **words}
 
 
 def _finite(values: Mapping[str, Any]) -> dict[str, Any]:

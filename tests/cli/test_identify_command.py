@@ -106,6 +106,28 @@ def test_a_log_of_another_maker_needs_a_servo(folder, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_screw_that_was_replaced_is_said(tmp_path):
+    """A log of a maintenance engineer: the same machine with a gap of 8 deg, then with one of 1 deg."""
+    servo, parts = Servo.preset("paper"), []
+    for gap in (8.0, 8.0, 1.0, 1.0):
+        part = simulate(servo, 10.0, reference=SquareWave(1e-3, 10.0), gap=math.radians(gap), sample_rate=2000.0)
+        parts.append(np.column_stack([part.position, part.theta_m, part.reference])[:-1])
+    rows = np.vstack(parts)
+    table = np.column_stack([np.arange(len(rows)) / 2000.0, rows])
+    names = "time_s,position_m,theta_m_rad,reference_m"
+    np.savetxt(tmp_path / "log.csv", table, fmt="%.10g", delimiter=",", header=names, comments="")
+    result = run(tmp_path / "log.csv", "--servo", "paper")
+    lines = [line for line in result.output.splitlines() if line.startswith("at ")]
+    assert [line.split(":")[0] for line in lines] == ["at 20.00 s", "at 25.00 s"]
+    assert "the gap has jumped from 8 to 1 deg, as after a crash, a repair or a new screw" in " ".join(
+        result.output.split()
+    )
+    windows = json.loads(run(tmp_path / "log.csv", "--servo", "paper", "--json").output)["windows"]
+    assert [len(window["remarks"]) for window in windows] == [0, 0, 0, 0, 1, 1, 0, 0]
+    assert "being an outlier" in windows[4]["remarks"][0]
+
+
+@pytest.mark.slow
 def test_one_window_may_be_chosen(folder):
     found = identify(IdentifyOptions(folder / "run.npz", start=5.0, duration=2.0))
     (window,) = found.windows

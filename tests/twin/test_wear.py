@@ -14,7 +14,7 @@ from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
-from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, MachineReading, OffsetReading
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.trend import Trend, TrendSettings
@@ -302,6 +302,35 @@ def test_a_gap_that_falls_and_rises_by_turns_is_said_once(turns):
     assert [place for place, sentence in enumerate(said) if sentence] == [len(turns), 2 * len(turns)]
     assert "has fallen from 7 to 5 deg" in said[len(turns)]
     assert "falls and rises by turns, now from 7 to 5 deg" in said[2 * len(turns)]
+
+
+@pytest.mark.parametrize("each", [2, 3])
+def test_gaps_by_turns_that_are_outliers_first_are_said_too(each):
+    """Two machines under one name, some windows of each: the trend starts afresh with every second one."""
+    turns = [gap for gap in (5.0, 30.0) for _ in range(each)]
+    said = told(*turns, *turns, *turns, *turns, every=5.0)
+    assert "has jumped from 5 to 30 deg" in said[each + 1]
+    assert "falls and rises by turns, now from 30 to 5 deg" in said[4 * each + 1]
+    assert sum("by turns" in sentence for sentence in said) == 1
+
+
+def test_a_reader_of_a_log_is_told_of_the_machine_and_not_of_settings():
+    wear, learning, said = Wear(0.0), LearningSettings(), []
+    for number, gap in enumerate([5.0, 7.0] * 3):
+        before, estimate = wear, seen(gap, 60.0 * number)
+        wear, _ = wear.update(SETTINGS, "log", estimate, 60.0 * number, learning)
+        said += wear.remarks(before, estimate, SETTINGS, learning)
+    assert said[-1].endswith("two machines may have this name, or it is another gap in other places")
+    other = replace(seen(5.0, 400.0, GapStatus.MODEL_MISMATCH), machine=machine(0.2))
+    for time in (360.0, 400.0):
+        before, estimate = wear, replace(seen(5.0, time), machine=machine(0.0)) if time == 360.0 else other
+        wear, _ = wear.update(SETTINGS, "log", estimate, time, learning)
+    [sentence] = wear.remarks(before, estimate, SETTINGS, learning)
+    assert "the machine is not the one that was learnt: k/m +22.1" in sentence
+
+
+def machine(k: float) -> MachineReading:
+    return MachineReading((k, 0.0, 0.0, 0.0), tuple(np.diag([1e-6] * 4).ravel().tolist()))
 
 
 def test_fast_wear_after_a_repair_is_no_other_machine():

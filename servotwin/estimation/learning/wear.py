@@ -8,6 +8,7 @@ pitch and mass ratio (`machine`), and the motor's back EMF, lag, friction and in
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -25,6 +26,7 @@ from servotwin.estimation.window import Window
 
 _JUMPS = 2  # contacts that are not where they were: once an encoder may have slipped, or have been homed anew
 _WHY_FALLEN = "after a repair or a new screw it may; else an encoder has slipped, or two machines have this name"
+_SETTING = re.compile(r"; no setting follows until [^;]*")
 NOT_LEARNING = LearningSettings(learn=False)
 
 
@@ -296,17 +298,29 @@ class Wear(Struct, frozen=True):
                 "together"
             )
         trend, earlier = self.trend(settings), before.trend(settings)
-        if trend is not None and not trend.afresh:
-            sentences += self._fallen(before)
-        if trend is not None and earlier is not None and trend.afresh and not earlier.afresh:
+        afresh = trend if trend is not None and trend.afresh else None
+        sentences += self._fallen(before, jumped=afresh is not None)
+        if afresh is not None and earlier is not None and not earlier.afresh:
             sentences.append(
-                f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(trend.gap):.3g} deg, as "
+                f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(afresh.gap):.3g} deg, as "
                 "after a crash, a repair or a new screw: it is followed from there"
             )
         return sentences
 
-    def _fallen(self, before: Wear) -> list[str]:
-        """Sentence on a gap that has fallen with this window, or once more; empty without one."""
+    def remarks(
+        self, before: Wear, estimate: GapEstimate, settings: TrendSettings, learning: LearningSettings
+    ) -> list[str]:
+        """List what a reader of a log should know after a window: as `alarms`, with those of the machine's numbers.
+
+        Parameters and result are those of `alarms`, without what the sentences say of settings.
+        """
+        sentences = self.alarms(before, estimate, settings, learning)
+        if self.machine is not None and self.machine != before.machine and self.machine.alarm:
+            sentences.append(self.machine.alarm)
+        return [_SETTING.sub("", sentence) for sentence in sentences]
+
+    def _fallen(self, before: Wear, jumped: bool) -> list[str]:
+        """Sentence on a gap that has fallen with this window, or once more; empty without one, or if a jump is said."""
         now, then = self.falls, before.falls
         if now is None or then is None:
             return []
@@ -316,7 +330,7 @@ class Wear(Struct, frozen=True):
                 f"the gap falls and rises by turns, now {ways}, which no wear does: two machines may have this name, "
                 "or it is another gap in other places; no setting follows until it has been one for some windows"
             ]
-        if now.fallen > 0.0 == then.fallen:
+        if now.fallen > 0.0 == then.fallen and not jumped:
             return [f"the gap has fallen {ways}, which no wear does: {_WHY_FALLEN}"]
         return []
 
