@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scaling import scaled
+from scaling import Units, scaled, scaled_window
 from scipy.linalg import expm
 
 from servotwin import Axis, DcMotor, Load, Servo, SquareWave, Transmission, Window, simulate
@@ -207,11 +207,13 @@ def test_a_load_that_acts_back_is_no_motor_of_this_kind() -> None:
     assert learning().updated(None, other, 0.0) is None
 
 
-def test_a_motor_that_is_always_at_its_drives_limit_teaches_nothing_and_that_is_said() -> None:
+@pytest.mark.parametrize("units", [Units(), Units(2.0**-10, 2.0**20, 2.0**7), Units(1e3, 1e-6, 1e-2)])
+def test_a_motor_that_is_always_at_its_drives_limit_teaches_nothing_and_that_is_said(units: Units) -> None:
     """Windows of a drive that cuts nearly every command; a window that tells of the motor ends the count."""
-    motor = DcMotor(PAPER.J, PAPER.R, PAPER.k_T, PAPER.k_B, PAPER.L, limit=2.0)
-    load = Load(tuple(PAPER.masses), tuple(PAPER.stiffnesses), tuple(PAPER.dampings))
-    of = motor_learning_of(Axis(motor, Transmission(PAPER.p), load, PAPER.controller), TwinSettings())
+    own = scaled(PAPER, *units)
+    motor = DcMotor(own.J, own.R, own.k_T, own.k_B, own.L, limit=2.0 * units.voltage)
+    load = Load(tuple(own.masses), tuple(own.stiffnesses), tuple(own.dampings))
+    of = motor_learning_of(Axis(motor, Transmission(own.p), load, own.controller), TwinSettings())
     square = 3.0 * np.sign(np.sin(12.0 * np.arange(5000) / RATE))
     cut = turned(PAPER, np.clip(square, -2.0, 2.0))
     always = Window(cut.position, theta_m=cut.theta_m, voltage=square, sample_rate=RATE)
@@ -221,8 +223,8 @@ def test_a_motor_that_is_always_at_its_drives_limit_teaches_nothing_and_that_is_
     wear, told = Wear(0.1), list[str]()
     for window in [*[always] * 5, turned(PAPER, wiggle(1)), *[always] * 3]:
         before = wear
-        wear, _ = before.update(trends, "b", estimate, 1.0, settings, None, window, of)
+        wear, _ = before.update(trends, "b", estimate, 1.0, settings, None, scaled_window(window, units), of)
         told.append("".join(wear.alarms(before, estimate, trends, settings, of)))
     assert [bool(sentence) for sentence in told] == [False, False, True, *[False] * 5, True]
-    assert "the drive's limit of 2 V in 100 % of the samples" in told[2]
+    assert f"the drive's limit of {2.0 * units.voltage:g} V in 100 % of the samples" in told[2]
     assert "tell nothing of the motor" in told[2]

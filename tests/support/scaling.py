@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from servotwin.config.toml import dumps
+from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 
@@ -44,6 +45,13 @@ def scaled(servo: Servo, time: float = 1.0, length: float = 1.0, voltage: float 
     }
     tracking = None if law.tracking_time is None else law.tracking_time * time
     return changed.replace(**limits, tracking_time=tracking, release_time=law.release_time * time)
+
+
+def scaled_window(window: Window, units: Units) -> Window:
+    """The same window of a servo in other units."""
+    factors = {"position": units.length, "reference": units.length, "voltage": units.voltage, "theta_m": 1.0}
+    channels = {name: factors[name] * samples for name, samples in window.channels.items()}
+    return Window(sample_rate=window.sample_rate / units.time, start=window.start * units.time, **channels)
 
 
 # Keys of an axis's file without a unit, and powers of (time, length, torque, voltage) of those with one.
