@@ -11,7 +11,7 @@ import numpy as np
 
 from servotwin.config.named_file import check_named
 from servotwin.config.table import did_you_mean
-from servotwin.config.units import SIGNAL_COLUMNS, unit_of
+from servotwin.config.units import SIGNAL_COLUMNS, suffix_of, unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
 from servotwin.logs.columns import LogColumns, Requested, SignalTable
@@ -20,6 +20,11 @@ from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
 TIME = "time_s"
+_OTHER_UNITS = (
+    *("nm", "um", "cm", "in", "inch", "arcsec", "arcmin", "mdeg", "mrad", "urad"),
+    *("rev", "revs", "turn", "turns", "counts", "mv", "kv"),
+)
+"""Units in which others write logs, as the ends of columns' names."""
 _COLUMN_NAMES = (TIME, *(name for names in SIGNAL_COLUMNS.values() for name in names))
 
 
@@ -150,6 +155,9 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
     """Names of the columns by channel."""
     every = SIGNAL_COLUMNS.items()
     chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in every}
+    for channel in ("position", "theta_m", "reference"):
+        if chosen[channel] is None:
+            _refuse_units(path, channel, columns)
     seen = chosen["position"] or (chosen["theta_m"] and chosen["voltage"])
     for name, place in (("position_m", seen), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
@@ -164,6 +172,18 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
             f"log {path}: columns {position!r} and {reference!r}: must both be lengths or both be angles"
         )
     return names
+
+
+def _refuse_units(path: Path, channel: str, columns: LogColumns) -> None:
+    """Refuse a log whose only column of a signal is in a unit that is not read: it would seem to be missing."""
+    allowed = SIGNAL_COLUMNS[channel]
+    signals = {name.removesuffix(f"_{suffix_of(name)}") for name in allowed}
+    for name in columns.names:
+        signal, _, unit = name.rpartition("_")
+        if signal in signals and unit in _OTHER_UNITS:
+            raise InvalidInput(
+                f"log {path}: column {name!r}: the unit {unit!r} is not read; give one of {', '.join(allowed)}"
+            )
 
 
 def _numbers(path: Path, name: str, columns: LogColumns) -> Array:

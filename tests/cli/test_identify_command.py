@@ -127,6 +127,25 @@ def test_a_screw_that_was_replaced_is_said(tmp_path):
     assert "being an outlier" in windows[4]["remarks"][0]
 
 
+@pytest.mark.parametrize(
+    ("column", "other"),
+    [("position_m", "position_um"), ("theta_m_rad", "theta_m_rev"), ("reference_m", "reference_um")],
+)
+def test_a_column_in_a_unit_that_is_not_read_is_named(folder, tmp_path, column, other):
+    """It would be taken for a column that is missing, and the gap be read without it."""
+    head, rest = (folder / "plain.csv").read_text().split("\n", 1)
+    (tmp_path / "log.csv").write_text(head.replace(column, other) + "\n" + rest)
+    unit = other.rpartition("_")[2]
+    with pytest.raises(InvalidInput, match=f"column '{other}': the unit '{unit}' is not read; give .*{column}"):
+        logfile.read_log(tmp_path / "log.csv")
+
+
+def test_a_column_that_only_begins_like_a_signal_is_ignored(folder, tmp_path):
+    head, rest = (folder / "plain.csv").read_text().split("\n", 1)
+    (tmp_path / "log.csv").write_text(head.replace("reference_m", "reference_speed") + "\n" + rest)
+    assert logfile.read_log(tmp_path / "log.csv").whole.reference is None
+
+
 @pytest.mark.slow
 def test_one_window_may_be_chosen(folder):
     found = identify(IdentifyOptions(folder / "run.npz", start=5.0, duration=2.0))
@@ -200,7 +219,7 @@ BAD = {
     "no rows": (lambda lines: lines[:1], "n >= 16 samples"),
     "blank rows": (lambda lines: [lines[0], "", ""], "n >= 16 samples"),
     "zeros": (lambda _lines: ["\0" * 100], "is not a text file"),
-    "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_m_turns"), *lines[1:]], "no theta_m"),
+    "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_motor"), *lines[1:]], "no theta_m"),
     "no position": (lambda lines: [lines[0].replace("position_m", "positon_m"), *lines[1:]], "mean 'positon_m'"),
     "no time": (lambda lines: [lines[0].replace("time_s", "t"), *lines[1:]], "column 'time_s' is missing"),
     "a word": (lambda lines: [*lines[:5], "1,two,3,4", *lines[5:]], "no table of numbers"),
