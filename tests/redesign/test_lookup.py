@@ -363,7 +363,9 @@ def test_a_table_of_another_version_is_refused(file: Path, monkeypatch) -> None:
 
 
 def test_a_table_on_another_grid_is_not_continued(file: Path) -> None:
-    with pytest.raises(InvalidInput, match="another grid"):
+    with pytest.raises(
+        InvalidInput, match=r"another grid \(cells from 15 deg on, biases of 0.01, 0.05 V, noises of 0, 1e-05 m\)"
+    ):
         next(build(file, POLICY, Grid(30.0 * DEG)))
 
 

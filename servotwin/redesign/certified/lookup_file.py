@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 from pathlib import Path
 from time import perf_counter
@@ -12,6 +13,7 @@ from msgspec import Struct
 import servotwin
 from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.fallback import flattened
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, cells_of, certify_cell, table_of
@@ -108,8 +110,19 @@ def _finished_cells(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[Cel
     file = _read(path)
     _check_owner(path, file, policy)
     if file.grid != grid:
-        raise InvalidInput(f"{path}: is a table on another grid ({file.grid}); choose another file, or remove it")
+        raise InvalidInput(
+            f"{path}: is a table on another grid ({_in_words(file.grid, policy)}); choose another file, or remove it"
+        )
     return dict(file.cells)
+
+
+def _in_words(grid: Grid, policy: CertifiedPolicy) -> str:
+    """A grid's cells, biases and noises with their units."""
+    biases, noises = (", ".join(f"{each:g}" for each in values) for values in (grid.biases, grid.noises))
+    return (
+        f"cells from {math.degrees(grid.finest):.4g} deg on, biases of {biases} {command_unit(policy.servo)}, "
+        f"noises of {noises} {position_unit(policy.servo).si}"
+    )
 
 
 def _read(path: Path) -> TableFile:
