@@ -276,7 +276,7 @@ def test_one_flank_is_found_where_a_gap_of_zero_and_its_noise_hide_it() -> None:
     swing = Samples(time, 7.382e-4 * np.clip(3.0 * np.sin(2.0 * math.pi * time / 6.0974), -1.0, 1.0))
     machine = axis.scaled({"k": 1.006, "c": 0.7492, "m": 1.1206, "k_T": 1.032, "k_B": 1.173})
     run = simulate(machine, 10.1, reference=swing, gap=0.4649, sample_rate=440.77)
-    window = Window.from_run(run, 5.0, 5.0)
+    window = Window.from_run(run, 5.05, 5.0)
     found = fit(window, axis, None, OutputErrorSettings())
     assert found.best.values[HALF] < 0.01 * 0.5 * 0.4649 * axis.p
     followed = min(each.cost for each in one_flank_without_a_gap(found))
