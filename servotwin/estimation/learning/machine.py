@@ -242,7 +242,7 @@ def _contradicted(
     if back:
         alarm = (
             f"windows of two machines come under this name, or of one with two loads: {rival.words()}, and "
-            f"{before.words()}; no setting follows until {mixed} windows in a row are of one of them"
+            f"{before.words()}; neither is relied on until {mixed} windows in a row are of one of them"
         )
     if rival.windows >= settings.restart_after:
         alarm = f"{alarm}; it is learnt anew from {rival.windows} windows that agree"

@@ -8,7 +8,6 @@ pitch and mass ratio (`machine`), and the motor's back EMF, lag, friction and in
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -26,7 +25,6 @@ from servotwin.estimation.window import Window
 
 _JUMPS = 2  # contacts that are not where they were: once an encoder may have slipped, or have been homed anew
 _WHY_FALLEN = "after a repair or a new screw it may; else an encoder has slipped, or two machines have this name"
-_SETTING = re.compile(r"; no setting follows until [^;]*")
 NOT_LEARNING = LearningSettings(learn=False)
 
 
@@ -312,12 +310,12 @@ class Wear(Struct, frozen=True):
     ) -> list[str]:
         """List what a reader of a log should know after a window: as `alarms`, with those of the machine's numbers.
 
-        Parameters and result are those of `alarms`, without what the sentences say of settings.
+        Parameters and result are those of `alarms`.
         """
         sentences = self.alarms(before, estimate, settings, learning)
         if self.machine is not None and self.machine != before.machine and self.machine.alarm:
             sentences.append(self.machine.alarm)
-        return [_SETTING.sub("", sentence) for sentence in sentences]
+        return sentences
 
     def _fallen(self, before: Wear, jumped: bool) -> list[str]:
         """Sentence on a gap that has fallen with this window, or once more; empty without one, or if a jump is said."""
@@ -328,7 +326,7 @@ class Wear(Struct, frozen=True):
         if now.by_turns and not then.by_turns:
             return [
                 f"the gap falls and rises by turns, now {ways}, which no wear does: two machines may have this name, "
-                "or it is another gap in other places; no setting follows until it has been one for some windows"
+                "or it is another gap in other places; none is relied on until it has been one for some windows"
             ]
         if now.fallen > 0.0 == then.fallen and not jumped:
             return [f"the gap has fallen {ways}, which no wear does: {_WHY_FALLEN}"]
