@@ -27,6 +27,7 @@ from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.loop import gain_units
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant, resolve_plant
+from servotwin.plant.release import release_time
 from servotwin.runtime.files import atomic_output, check_file
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
@@ -106,6 +107,9 @@ def _write(request: TuneOptions, servo: Plant, law: AnyController) -> None:
     if request.output is None:
         return
     servo.check_loop(law)
+    if servo.controller.release_time == release_time(servo.margins):
+        # Nobody stated it: it is that of the loop with the old gains.
+        law = law.replace(release_time=None)
     changed = dataclasses.replace(servo, controller=law)  # type: ignore[arg-type]
     with atomic_output(request.output) as temporary:
         temporary.write_text(changed.dumps(), encoding="utf-8")

@@ -130,6 +130,9 @@ def commission(
         axis = replace(
             axis, controller=tune_cascade(_with_cascade(axis, crossover), crossover, _PHASE_MARGIN).controller
         )
+    if axis is not None:
+        # That of the loop as it is now, with the shaft and the gains found.
+        axis = replace(axis, controller=axis.controller.replace(release_time=None))
     return replace(found, axis=axis, uncertainty=_uncertainty(found, travel))
 
 

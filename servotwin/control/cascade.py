@@ -118,7 +118,7 @@ class Cascade:
         ),
     ] = None
     feedforward: Annotated[float, key("feedforward_v", help="Command added at all times.")] = 0.0
-    release_time: ReleaseTime = 0.5
+    release_time: ReleaseTime = None
 
     def __post_init__(self) -> None:
         check(self)

@@ -6,7 +6,7 @@ from typing import Annotated, TypedDict, Unpack
 
 from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, items_of, key, replaced, settings
-from servotwin.control.law import LawParameters
+from servotwin.control.law import LawParameters, release_of
 from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
 from servotwin.errors import InvalidInput
 from servotwin.runtime.notebook import html_table
@@ -32,7 +32,7 @@ class ControllerChanges(TypedDict, total=False):
     sample_rate: float | None
     tracking_time: float | None
     feedforward: float
-    release_time: float
+    release_time: float | None
     integral_only: bool
     velocity_feedforward: float
     velocity_time: float
@@ -93,7 +93,7 @@ class Controller:
             help="Voltage added at all times, inside the dead zone too; it cancels a bias of the plant's input.",
         ),
     ] = 0.0
-    release_time: ReleaseTime = 0.5
+    release_time: ReleaseTime = None
     integral_only: Annotated[
         bool,
         key(
@@ -187,6 +187,11 @@ class Controller:
         return usual if usual >= _SLOW * reset else reset
 
     @property
+    def release(self) -> float:
+        """Time constant with which the offset after a change of the law fades, s."""
+        return release_of(self.release_time)
+
+    @property
     def notch_gain(self) -> float:
         """Share of its band-pass that the notch takes away; 0: there is no notch."""
         return 2.0 * self.notch_damping * (1.0 - self.notch_depth) if self.notch_hz else 0.0
@@ -229,7 +234,7 @@ class Controller:
             # At most 1: a tracking time below one tick would overcorrect the integral.
             tracking_step=step / max(step, self.tracking),
             feedforward=float(self.feedforward),
-            release_step=-expm1(-step / self.release_time),
+            release_step=-expm1(-step / self.release),
             acting_inside=1.0 if self.integral_only else 0.0,
             velocity_gain=self.velocity_feedforward / self.velocity_time,
             velocity_step=-expm1(-step / self.velocity_time),

@@ -115,6 +115,11 @@ class LawState(NamedTuple):
     notch_low: float = 0.0
 
 
+def release_of(release_time: float | None) -> float:
+    """Time constant (s) with which an offset fades: the paper's loop's where neither a file nor a machine gave one."""
+    return 0.5 if release_time is None else release_time
+
+
 def start(measurement: float) -> LawState:
     """State at rest at `measurement` (m), the loop closed."""
     return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement, 0.0, 0.0, 0.0, 0.0)

@@ -15,10 +15,11 @@ SampleRate = Annotated[
     float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
 ]
 ReleaseTime = Annotated[
-    float,
+    float | None,
     key(
         "release_time_s",
         above=0.0,
-        help="Time constant with which the offset of the command after a change of the setting fades.",
+        help="Time constant with which the offset of the command after a change of the setting fades; where absent "
+        "five over the loop's first gain crossover, 0.5 s of a law whose machine is not known.",
     ),
 ]

@@ -9,6 +9,7 @@ from typing import Any
 
 from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import replaced
+from servotwin.control.law import release_of
 from servotwin.control.linear_tick import LinearParameters, LinearState, linear_transfer
 from servotwin.control.matrices import Rows, at_rest, zero_order_held
 from servotwin.errors import InvalidInput
@@ -57,8 +58,8 @@ class LinearLaw:
         Back-calculation: added to x' per unit of the command that the limits cut off; none by default.
     feedforward : float
         Always added to the command.
-    release_time : float
-        Time constant with which the offset after a change of the law fades, s.
+    release_time : float, optional
+        Time constant with which the offset after a change of the law fades, s; 0.5 s where absent.
     gain : float
         Factor on the whole law.
     integral_share : float
@@ -87,7 +88,7 @@ class LinearLaw:
     rate_limit: float | None = None
     windup: tuple[float, ...] = ()
     feedforward: float = 0.0
-    release_time: float = 0.5
+    release_time: float | None = None
     gain: float = 1.0
     integral_share: float = 1.0
     B_inside: Rows = ()
@@ -209,6 +210,11 @@ class LinearLaw:
         """Factors (motor, load) of the measurements that the dead zone compares with the reference."""
         return (self.ratio, 0.0) if self.on == MOTOR else (0.0, 1.0)
 
+    @property
+    def release(self) -> float:
+        """Time constant with which the offset after a change of the law fades, s."""
+        return release_of(self.release_time)
+
     def reads(self, name: str) -> bool:
         """True where the law depends on one of its `INPUTS`."""
         column = INPUTS.index(name)
@@ -319,7 +325,7 @@ class LinearLaw:
             limit=inf if self.voltage_limit is None else float(self.voltage_limit),
             rate_step=inf if self.rate_limit is None else self.rate_limit / self.sample_rate,
             feedforward=float(self.feedforward),
-            release_step=-expm1(-1.0 / (self.sample_rate * self.release_time)),
+            release_step=-expm1(-1.0 / (self.sample_rate * self.release)),
         )
 
     def start(self, y_motor: float, y_load: float) -> LinearState:

@@ -84,7 +84,7 @@ def matrices_law(
     rate_limit: RateLimit = None,
     windup: Windup = (),
     feedforward: Feedforward = 0.0,
-    release_time: ReleaseTime = 0.5,
+    release_time: ReleaseTime = None,
     gain: Gain = 1.0,
     integral_share: IntegralShare = 1.0,
     B_inside: InsideRows = (),

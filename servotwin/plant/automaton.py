@@ -238,7 +238,7 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
             flow[..., basis["notch band"], :] = omega * (zone.pidf - low - 2.0 * controller.notch_damping * band)
             flow[..., basis["notch low"], :] = omega * band
         if shape.offset:
-            flow[..., basis["offset"], :] = -basis.row("offset") / controller.release_time
+            flow[..., basis["offset"], :] = -basis.row("offset") / controller.release
         flows.append(flow)
     return system.parts(flows, error=error, measured_position=sensed)
 

@@ -33,6 +33,7 @@ from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.loop_set import sampled_margins
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.release import released
 from servotwin.plant.rest import Rest, rest_under_force
 from servotwin.plant.scaled_parts import scaled_parts
 from servotwin.plant.sensors import MOTOR, Sensors, check_encoders
@@ -81,6 +82,7 @@ class Axis:
         check_kinds({name: getattr(self, name) for name in PARTS})
         check_fit(self.actuator, self.transmission, self.load, self.controller)
         check_encoders(self, law_of(self.controller))
+        object.__setattr__(self, "controller", released(self.controller, self.margins))
 
     @classmethod
     def preset(cls, name: str) -> Axis:

@@ -199,7 +199,7 @@ class LawNumbers(Protocol):
         ...
 
     @property
-    def release_time(self) -> float | Array:
+    def release(self) -> float | Array:
         """Time constant of an offset, s."""
         ...
 

@@ -57,7 +57,7 @@ def linear_law(
     rate_limit: law_keys.RateLimit = None,
     windup: keys.Windup = (),
     feedforward: keys.Feedforward = 0.0,
-    release_time: law_keys.ReleaseTime = 0.5,
+    release_time: law_keys.ReleaseTime = None,
     gain: keys.Gain = 1.0,
     integral_share: keys.IntegralShare = 1.0,
     B_inside: keys.InsideRows = (),

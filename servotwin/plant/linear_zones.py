@@ -56,7 +56,7 @@ def linear_parts(servo: Plant, law: LinearLaw, shape: Shape) -> LoopParts:
         flow = mechanical_flow(servo, basis, contact, stick_slip, driven.command)
         flow[states] = driven.piece.rates
         if shape.offset:
-            flow[basis["offset"]] = -basis.row("offset") / law.release_time
+            flow[basis["offset"]] = -basis.row("offset") / law.release
         flows.append(flow)
     return modes.parts(flows, error=error, measured_position=inputs[2])
 

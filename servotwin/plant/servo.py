@@ -30,6 +30,7 @@ from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
 from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.release import released
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
@@ -119,6 +120,7 @@ class Servo:
                 raise InvalidInput(f"servo {name} ({own}) = {value!r}: {count}")
             if name != "n":
                 object.__setattr__(self, name, tuple(map(float, value)) if isinstance(value, tuple) else float(value))
+        object.__setattr__(self, "controller", released(self.controller, self.margins))
 
     def __repr__(self) -> str:
         """Preset or model version, masses, screw and controller in one line."""

@@ -116,7 +116,7 @@ class LawStack:
     enter: Array
     leave: Array
     tracking: Array
-    release_time: Array
+    release: Array
     velocity_feedforward: Array
     velocity_time: Array
     notch_hz: Array
@@ -129,7 +129,7 @@ class LawStack:
     @classmethod
     def of(cls, laws: Sequence[Controller]) -> LawStack:
         """Numbers of controllers."""
-        names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release_time"]
+        names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release"]
         names += ["velocity_feedforward", "velocity_time", "notch_hz", "notch_damping", "notch_gain"]
         optional = ("loop_filter_hz", "voltage_limit")
         columns: dict[str, Any] = {name: _column(laws, name) for name in names}

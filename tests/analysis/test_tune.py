@@ -278,3 +278,14 @@ def test_a_margin_that_only_cancelling_gains_give_is_refused_with_the_reason(mon
     monkeypatch.setattr(candidates, "_MOST_CANCELLATION", 0.5)
     with pytest.raises(InvalidInput, match=r"60 deg without Kp and Kd / Tf that act .* over 0\.5 times its"):
         tune(Axis.preset("stepper-stage").plant(), Specification(20.0, math.radians(60.0)))
+
+
+@pytest.mark.parametrize("stated", [None, 0.7])
+def test_the_release_time_is_that_of_the_new_loop_unless_it_is_stated(tmp_path, stated):
+    axis = Axis.preset("gantry")
+    old, new = tmp_path / "old.toml", tmp_path / "new.toml"
+    old.write_text(axis.replace(release_time=stated).dumps())
+    assert run(4.0, 60, "--servo", old, "--output", new).exit_code == 0
+    tuned = Axis.from_file(new)
+    assert tuned.pidf.Kp != axis.pidf.Kp
+    assert tuned.pidf.release == (stated or pytest.approx(5.0 / 4.0, rel=1e-6))

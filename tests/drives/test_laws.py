@@ -58,6 +58,7 @@ def simulated(law: AnyController, changed: AnyController | None = None) -> NDArr
     ids=["cascade", "linear"],
 )
 def test_a_supervised_machine_runs_any_law_and_takes_its_numbers(law: AnyController, changes: dict[str, Any]) -> None:
+    law = SCREW.replace(controller=law).controller
     changed = law.replace(**changes)
     plant = SupervisedPlant(settings(law, "supervise"))
     packed = wire.packed_gains(gains_of(changed))

