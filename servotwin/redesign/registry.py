@@ -33,7 +33,7 @@ class PolicyOptions(Protocol):
     @property
     def demands(self) -> Demands: ...
     @property
-    def horizon(self) -> float: ...
+    def holds_for(self) -> float: ...
     @property
     def table(self) -> str | None: ...
     @property
@@ -80,7 +80,7 @@ def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
     low, high = options.uncertainty.input_bias
     limit = max(abs(low), abs(high))
     return CertifiedPolicy(
-        servo, options.uncertainty, options.demands, feedforward_limit=limit, horizon=options.horizon
+        servo, options.uncertainty, options.demands, feedforward_limit=limit, horizon=options.holds_for
     )
 
 

@@ -103,7 +103,7 @@ class Requests:
         if settings.excitation is None:
             return None
         policy = ExcitationPolicy(servo.p, settings.excitation, position_unit(servo))
-        return cls(policy, settings.retry, settings.attempts, settings.validity, settings.uncertainty.gap[1])
+        return cls(policy, settings.retry, settings.attempts, settings.valid_for, settings.uncertainty.gap[1])
 
     def decide(
         self,

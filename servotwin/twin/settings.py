@@ -181,14 +181,14 @@ class TwinSettings:
         ),
     ] = None
     horizon: Annotated[
-        float,
+        float | None,
         key(
             "horizon_s",
             minimum=0.0,
             help="Time for which a certified setting is to hold: it is verified for the gap as the trend lets it grow "
-            "meanwhile.",
+            "meanwhile. Where absent 40 s, of a slow machine 40 of its own seconds.",
         ),
-    ] = 40.0
+    ] = None
     silence: Annotated[
         float,
         key(
@@ -251,13 +251,14 @@ class TwinSettings:
         ),
     ] = 0.0
     validity: Annotated[
-        float,
+        float | None,
         key(
             "validity_s",
             above=0.0,
-            help="Time after a window's first sample within which an update computed from it may be applied.",
+            help="Time after a window's first sample within which an update computed from it may be applied. Where "
+            "absent 60 s, of a slow machine, whose windows are long, 60 of its own seconds.",
         ),
-    ] = 60.0
+    ] = None
     retry: Annotated[
         float,
         key(
@@ -285,18 +286,32 @@ class TwinSettings:
         """
         second, _, volt = scales(servo)
         friction = float(servo.command_of(servo.own_friction))
+        slow = max(1.0, second)  # a fast machine's link takes no less time
+        horizon = slow * self.holds_for if self.horizon is None else self.horizon
         return replace(
             self,
-            trend=self._trend(servo, second),
+            horizon=horizon,
+            validity=slow * self.valid_for if self.validity is None else self.validity,
+            trend=self._trend(servo, second, horizon),
             excitation=None if self.excitation is None else self.excitation.on(second),
             triage=None if self.triage is None else self.triage.on(volt, friction, self.uncertainty.step[0]),
         )
 
-    def _trend(self, servo: Plant, second: float) -> TrendSettings:
+    @property
+    def holds_for(self) -> float:
+        """Time for which a certified setting is to hold, s: as stated, otherwise that of the paper's servo."""
+        return 40.0 if self.horizon is None else self.horizon
+
+    @property
+    def valid_for(self) -> float:
+        """Time after a window's first sample within which its update may be applied, s: likewise."""
+        return 60.0 if self.validity is None else self.validity
+
+    def _trend(self, servo: Plant, second: float, horizon: float) -> TrendSettings:
         if self.trend != TrendSettings():
             return self.trend
-        if isinstance(servo, Axis) and self.horizon > 0.0:
-            return TrendSettings.within(self.uncertainty.gap[1], self.horizon)
+        if isinstance(servo, Axis) and horizon > 0.0:
+            return TrendSettings.within(self.uncertainty.gap[1], horizon)
         return TrendSettings.on(second)
 
     def initial_tolerance(self, servo: Plant) -> float:

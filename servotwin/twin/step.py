@@ -243,7 +243,7 @@ def _send_redesign(
     """Send the setting of a redesign, or keep it as a proposal where an engineer is asked first."""
     if redesign.setting is None:
         return StepResult(state)
-    draft, overseen = draft_update(message, evidence, redesign, model.settings.validity), state.oversight
+    draft, overseen = draft_update(message, evidence, redesign, model.settings.valid_for), state.oversight
     if overseen.ask_first and not overseen.held:
         if not overseen.proposes_anew(message):
             return StepResult(state)

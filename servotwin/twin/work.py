@@ -147,7 +147,7 @@ class _Worker:
             decoded: Iterator[tuple[int, Event]] = self._decoded(batch)
         else:
             events = list(self._decoded(batch))
-            decoded = iter(_urgent(events, self.state, self.model.settings.validity, now, urgency))
+            decoded = iter(_urgent(events, self.state, self.model.settings.valid_for, now, urgency))
         for message, event in decoded:
             # Acts are kept although the twin is switched off, but for the one that sends something.
             if not self.model.settings.enabled:

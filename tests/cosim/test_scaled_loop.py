@@ -28,7 +28,6 @@ def loop(units: Units) -> Loop:
     twin = TwinSettings(
         policy="paper",
         uncertainty=dataclasses.replace(steps, input_bias=(-0.1 * units.voltage, 0.1 * units.voltage)),
-        validity=60.0 * units.time,
         excitation=ExcitationSettings(),
         learning=LearningSettings(k_drift=0.0, c_drift=0.0),  # the default is per day
         triage=TriageSettings(longest=3600.0 * units.time),

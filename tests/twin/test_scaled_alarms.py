@@ -120,7 +120,6 @@ def told(name: Callable[[], list[Window]], units: Units) -> Told:
         policy="hysteresis",
         uncertainty=Uncertainty(step=steps, input_bias=(-bias, bias)),
         learning=LearningSettings(k_drift=0.0, c_drift=0.0, motor_drift=0.0),  # the defaults are per day
-        validity=60.0 * units.time,
     )
     model = TwinModel.of(scaled(servo, *units), settings)
     state, made = model.initial_state("axis"), Told([], [], [])

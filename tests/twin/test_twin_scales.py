@@ -56,6 +56,15 @@ def test_what_a_file_leaves_out_is_in_the_machines_own_units(units: Units) -> No
     assert found.on(scaled(SERVO, *units)) == found
 
 
+@pytest.mark.parametrize(("time", "slow"), [(1e3, 1e3), (1.0, 1.0), (1e-3, 1.0)])
+def test_updates_of_a_slow_machine_hold_for_longer_and_those_of_a_fast_one_as_long_as_the_link_needs(
+    time: float, slow: float
+) -> None:
+    machine = scaled(SERVO, time)
+    found = SETTINGS.on(machine)
+    assert (found.holds_for, found.valid_for) == pytest.approx((slow * 40.0, slow * 60.0))
+
+
 @pytest.mark.parametrize("name", ["ball-screw", "robot-joint"])
 def test_an_axis_without_a_trend_wears_within_its_stated_range(name: str) -> None:
     axis, paper = Axis.preset(name), TrendSettings()
@@ -114,6 +123,8 @@ def test_what_a_file_states_counts() -> None:
         trend=TrendSettings.for_wear(0.1, 100.0),
         excitation=ExcitationSettings(window=3.0, pre_trigger=0.1, interval=9.0, hold=1.0),
         triage=TriageSettings(least_misfit=1e-6, bias=1e-2),
+        horizon=7.0,
+        validity=9.0,
     )
     assert stated.on(scaled(SERVO, 10.0, 10.0, 10.0)) == stated
 

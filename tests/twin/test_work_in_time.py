@@ -120,7 +120,7 @@ def test_a_hello_in_the_lease_tells_the_live_boot():
 def test_no_setting_is_computed_that_would_come_too_late():
     window = windows()[1]
     spent = window.samples / window.rate
-    in_time, late = 100.0 + QUICK.validity - spent - 0.5, 100.0 + QUICK.validity - spent + 0.5
+    in_time, late = 100.0 + QUICK.valid_for - spent - 0.5, 100.0 + QUICK.valid_for - spent + 0.5
     sent = claim(window, received=[100.0])
     assert work(fleet(), sent, in_time, Urgency()).outgoing
     assert work(fleet(), sent, in_time, Urgency(expected_s=1.0)).outgoing == ()
