@@ -117,7 +117,7 @@ def write_report(servo: str, source: Source, to: Path) -> None:
             text = opened.get(f"/v1/servos/{quote(servo, safe='')}/report.html").decode()
         with files.atomic_output(to) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        print(f"servotwin audit: wrote {to}")
+        print(f"written: {to}")
 
 
 def servos(source: Source, json: bool) -> None:
