@@ -153,6 +153,10 @@ class Scenario:
     def from_table(cls, table: Table, folder: Path) -> Scenario:
         """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
+            if "servo" not in table.values and table.values.keys() & {"structure", "actuator"}:
+                raise InvalidInput(
+                    "is a servo or an axis, not a scenario; write a scenario whose key 'servo' names this file"
+                )
             servo: Plant = attribute(table, cls, "servo", folder)
             table = table.in_units(own_units(servo), servo.p)
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))

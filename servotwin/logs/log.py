@@ -25,6 +25,7 @@ _OTHER_UNITS = (
     *("rev", "revs", "turn", "turns", "counts", "mv", "kv"),
 )
 """Units in which others write logs, as the ends of columns' names."""
+_OTHER_TIMES = ("ms", "us", "ns", "min", "h")
 _COLUMN_NAMES = (TIME, *(name for names in SIGNAL_COLUMNS.values() for name in names))
 
 
@@ -157,7 +158,9 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
     chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in every}
     for channel in ("position", "theta_m", "reference"):
         if chosen[channel] is None:
-            _refuse_units(path, channel, columns)
+            _refuse_units(path, SIGNAL_COLUMNS[channel], columns, _OTHER_UNITS)
+    if TIME not in columns.values:
+        _refuse_units(path, (TIME,), columns, _OTHER_TIMES)
     seen = chosen["position"] or (chosen["theta_m"] and chosen["voltage"])
     for name, place in (("position_m", seen), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
@@ -174,16 +177,14 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
     return names
 
 
-def _refuse_units(path: Path, channel: str, columns: LogColumns) -> None:
+def _refuse_units(path: Path, allowed: tuple[str, ...], columns: LogColumns, others: tuple[str, ...]) -> None:
     """Refuse a log whose only column of a signal is in a unit that is not read: it would seem to be missing."""
-    allowed = SIGNAL_COLUMNS[channel]
     signals = {name.removesuffix(f"_{suffix_of(name)}") for name in allowed}
     for name in columns.names:
         signal, _, unit = name.rpartition("_")
-        if signal in signals and unit in _OTHER_UNITS:
-            raise InvalidInput(
-                f"log {path}: column {name!r}: the unit {unit!r} is not read; give one of {', '.join(allowed)}"
-            )
+        if signal in signals and unit in others:
+            given = f"one of {', '.join(allowed)}" if len(allowed) > 1 else allowed[0]
+            raise InvalidInput(f"log {path}: column {name!r}: the unit {unit!r} is not read; give {given}")
 
 
 def _numbers(path: Path, name: str, columns: LogColumns) -> Array:

@@ -44,7 +44,12 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".", tuned
         every = (*PRESETS, *AXES)
         hint = did_you_mean(name_or_path, every)
         raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
-    return Axis.from_file(path, tuned) if "actuator" in read_toml(path).values else Servo.load(path, tuned)
+    values = read_toml(path).values
+    if {"servo", "duration_s"} <= values.keys():
+        raise InvalidInput(
+            f"{path}: is a scenario, not a servo or an axis; its key 'servo' names its servo, {values['servo']!r}: give that"
+        )
+    return Axis.from_file(path, tuned) if "actuator" in values else Servo.load(path, tuned)
 
 
 def plant_of(text: str, source: str) -> Plant:

@@ -10,6 +10,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import paper
 from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.link.simulated import LinkSettings
+from servotwin.plant.axis import Axis
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples, SCurve, SquareWave, Step
@@ -150,6 +151,13 @@ def test_another_servo_keeps_what_the_scenario_says_of_the_controller():
 def test_steps_of_1_mm_are_a_replacement_away():
     scenario = Scenario.preset("fig15").replace(reference=SquareWave(0.5e-3, 40.0, 0.5e-3))
     assert scenario.reference.pieces(200.0).value([0.0, 20.0]).tolist() == [1e-3, 0.0]
+
+
+@pytest.mark.parametrize("machine", [Servo.preset("paper"), Axis.preset("ball-screw")])
+def test_a_servo_or_an_axis_in_place_of_a_scenario_is_called_one(tmp_path, machine):
+    (tmp_path / "machine.toml").write_text(machine.dumps(), encoding="utf-8")
+    with pytest.raises(InvalidInput, match="machine.toml: is a servo or an axis, not a scenario; .* key 'servo' names"):
+        Scenario.load(tmp_path / "machine.toml")
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,12 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         resolve_plant("gantri", tmp_path)
 
 
+def test_a_scenario_in_place_of_its_servo_is_called_one(tmp_path: Path) -> None:
+    (tmp_path / "scenario.toml").write_text('servo = "ball-screw"\nduration_s = 2.0\n', encoding="utf-8")
+    with pytest.raises(InvalidInput, match=r"scenario.toml: is a scenario.*key 'servo' names its servo, 'ball-screw'"):
+        resolve_plant("scenario.toml", tmp_path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
