@@ -129,7 +129,12 @@ def test_a_screw_that_was_replaced_is_said(tmp_path):
 
 @pytest.mark.parametrize(
     ("column", "other"),
-    [("position_m", "position_um"), ("theta_m_rad", "theta_m_rev"), ("reference_m", "reference_um"), ("time_s", "time_ms")],
+    [
+        ("position_m", "position_um"),
+        ("theta_m_rad", "theta_m_rev"),
+        ("reference_m", "reference_um"),
+        ("time_s", "time_ms"),
+    ],
 )
 def test_a_column_in_a_unit_that_is_not_read_is_named(folder, tmp_path, column, other):
     """It would be taken for a column that is missing, and the gap be read without it."""

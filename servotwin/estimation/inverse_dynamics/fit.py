@@ -145,9 +145,9 @@ def fit_models(rows: Rows) -> tuple[ParameterFit, ParameterFit]:
     )
 
 
-def widened(fit: ParameterFit, other: ParameterFit) -> ParameterFit:
-    """Fit whose covariance also contains its difference to another one that may as well be true."""
-    off = fit.values - other.values
+def widened(fit: ParameterFit, other: ParameterFit, share: float = 1.0) -> ParameterFit:
+    """Fit whose covariance also contains its difference to another one that may as well be true, or a share of it."""
+    off = share * (fit.values - other.values)
     return replace(fit, covariance=fit.covariance + np.outer(off, off))
 
 

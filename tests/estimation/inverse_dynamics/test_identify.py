@@ -33,6 +33,16 @@ def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
         assert getattr(drive.law, name) == pytest.approx(true, rel=1e-3), name
 
 
+@pytest.mark.parametrize(("rate", "every"), [(2000.0, 2), (2000.0, 8), (5000.0, 10)])
+def test_intervals_hold_in_a_log_that_is_slower_than_its_controller(rate, every):
+    """No law at the log's rate is the one that ran."""
+    fast = simulated(rate=rate)
+    thinned = (each[::every] for each in (fast.position, fast.force, fast.reference))
+    drive = identify_drive([recording_of(*thinned, rate=rate / every)], p=P)
+    for name, true in PARAMETERS.items():
+        assert abs(drive.refinement.symmetric[name] - true) <= drive.refinement.symmetric.half_width(name), name
+
+
 def test_gains_that_are_given_are_taken_as_they_are():
     law = fitted_cascade(simulated(), GivenGains(**GAINS, speed_filter=3e-3))
     assert (law.position_gain, law.velocity_gain, law.speed_filter) == (*GAINS.values(), 3e-3)
