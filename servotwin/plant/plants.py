@@ -47,7 +47,8 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".", tuned
     values = read_toml(path).values
     if {"servo", "duration_s"} <= values.keys():
         raise InvalidInput(
-            f"{path}: is a scenario, not a servo or an axis; its key 'servo' names its servo, {values['servo']!r}: give that"
+            f"{path}: is a scenario, not a servo or an axis; its key 'servo' names its servo, "
+            f"{values['servo']!r}: give that"
         )
     return Axis.from_file(path, tuned) if "actuator" in values else Servo.load(path, tuned)
 

@@ -156,7 +156,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
 @pytest.mark.parametrize("machine", [Servo.preset("paper"), Axis.preset("ball-screw")])
 def test_a_servo_or_an_axis_in_place_of_a_scenario_is_called_one(tmp_path, machine):
     (tmp_path / "machine.toml").write_text(machine.dumps(), encoding="utf-8")
-    with pytest.raises(InvalidInput, match="machine.toml: is a servo or an axis, not a scenario; .* key 'servo' names"):
+    with pytest.raises(InvalidInput, match=r"machine.toml: is a servo or an axis, not a scenario"):
         Scenario.load(tmp_path / "machine.toml")
 
 
