@@ -50,9 +50,12 @@ _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 _SQL_DAMAGE = ("XX001", "XX002")
 _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
-_NOT_AS_MADE = ("3F000", "42P01", "42703", "42501")
-"""SQLSTATE of a schema, table or column that is not there, and of a right that was taken away: the driver counts them
-among faults of the statement, but the same statements worked before."""
+_NOT_AS_MADE = ("3F000", "42P01", "42703", "42501", "42804", "42883")
+"""SQLSTATE of a schema, table or column that is not there, of a right that was taken away, and of a column of another
+type: the driver counts them among faults of the statement, but the same statements worked before."""
+_OF_THE_SESSION = ("25006", "57014")
+"""SQLSTATE of a write in a read-only transaction, and of a statement that took too long: a session keeps the limits of
+its beginning for ever, though the database has other ones meanwhile."""
 
 
 class StoreUnavailable(ResourceUnavailable):
@@ -181,7 +184,7 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
         The database is not available now.
     """
     try:
-        with engine.begin() as connection:
+        with engine.begin() as connection, _session_ended(connection):
             yield connection
     except DBAPIError as error:
         if isinstance(error, _CALLERS_FAULT) and _is_of_the_statement(error):
@@ -193,6 +196,17 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
         raise _unavailable(engine, str(error.orig)) from error.orig
     except (PoolTimeout, sqlite3.Error) as error:
         raise _unavailable(engine, str(error)) from None
+
+
+@contextmanager
+def _session_ended(connection: sa.Connection) -> Iterator[None]:
+    """End a session whose own limits made a block fail: the next transaction begins another one."""
+    try:
+        yield
+    except DBAPIError as error:
+        if getattr(error.orig, "sqlstate", None) in _OF_THE_SESSION:
+            connection.invalidate(error)
+        raise
 
 
 def lost_race(error: StoreUnavailable) -> bool:

@@ -176,6 +176,16 @@ class GroupCommit:
         _resolve([future for _, future in commits], valid)
 
 
+class _Failure(NamedTuple):
+    at: float
+    why: str
+
+
+_NEVER = _Failure(-math.inf, "")
+_OUTDATED_S = 60.0
+"""s after which the failure of a result says nothing where other writes succeed: another process did that work."""
+
+
 class AwaitedCommits:
     """Writes of a group commit for an event loop, which awaits them.
 
@@ -187,19 +197,24 @@ class AwaitedCommits:
     clock : callable
         Monotonic seconds.
 
-    Attributes
-    ----------
-    failed_at : float
-        Time of the last failure, on `clock`; -inf: the last write succeeded.
-    failure : str
-        Reason of that failure.
     """
 
     def __init__(self, commits: GroupCommit, clock: Callable[[], float] = time.monotonic) -> None:
         self._commits, self._clock = commits, clock
         self._done: deque[tuple[asyncio.Future[Any], Future[Any]]] = deque()
         self._begun = dict[object, float]()
-        self.failed_at, self.failure = -math.inf, ""
+        # Apart: where only results cannot be written, as without a right on their tables, messages come every second.
+        self._failed = {Incoming: _NEVER, WorkResult: _NEVER}
+
+    @property
+    def failed_at(self) -> float:
+        """Time of the last failure, on `clock`; -inf: the last message and the last result were written."""
+        return max(self._failed.values()).at
+
+    @property
+    def failure(self) -> str:
+        """Reason of that failure."""
+        return max(self._failed.values()).why
 
     @property
     def waited(self) -> float:
@@ -220,11 +235,13 @@ class AwaitedCommits:
         try:
             result = await self._wrap(write(record))
         except StoreUnavailable as error:
-            self.failed_at, self.failure = self._clock(), str(error)
+            self._failed[type(record)] = _Failure(self._clock(), str(error))
             raise
         finally:
             del self._begun[mark]
-        self.failed_at, self.failure = -math.inf, ""
+        self._failed[type(record)] = _NEVER
+        if self._failed[WorkResult].at < self._clock() - _OUTDATED_S:
+            self._failed[WorkResult] = _NEVER
         return result
 
     def _wrap(self, future: Future[_Result]) -> asyncio.Future[_Result]:

@@ -244,7 +244,8 @@ class _JsonLines(logging.Formatter):
 def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handler:
     """Log to `stream` (standard error) from `level` on; returns the handler, so that it can be removed.
 
-    uvicorn logs only warnings: its access log would hold every request.
+    uvicorn logs only warnings: its access log would hold every request. The driver of PostgreSQL logs only errors: its
+    warnings repeat in other words what it raises.
     """
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(_JsonLines())
@@ -253,7 +254,9 @@ def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handl
     service.setLevel(level.upper())
     server = logging.getLogger("uvicorn")
     server.setLevel(logging.WARNING)
-    for logger in (service, server):
+    driver = logging.getLogger("psycopg")
+    driver.setLevel(logging.ERROR)
+    for logger in (service, server, driver):
         logger.addHandler(handler)
         logger.propagate = False
     return handler

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import psycopg
@@ -32,7 +33,7 @@ from servotwin.store.engine import (
 from servotwin.store.records import MessageKind, PutResult
 from servotwin.store.results import _locked_serials
 from servotwin.store.schema import REVISION, metadata, twins
-from servotwin.store.store import open_store
+from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
 SECRET = "unspeakable"
@@ -268,6 +269,34 @@ def test_a_server_that_cuts_its_connections_is_survived(postgres_server: Server)
     assert store.put([window(sequence=2)]) == [PutResult.NEW]
     assert store.servo("a").windows == 2
     store.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limit", "reason"),
+    [("default_transaction_read_only = on", "read-only transaction"), ("statement_timeout = 1", "statement timeout")],
+)
+def test_limits_of_the_server_that_are_over_are_over_for_connections_that_began_under_them(
+    postgres_server: Server, limit: str, reason: str
+) -> None:
+    """A session keeps the settings of its beginning; a twin whose pool kept such ones refused windows for ever."""
+    name = limit.partition(" ")[0]
+    url = postgres_server.database(name)
+    open_store(url).close()
+    with closing(open_store(url)) as store:
+        postgres_server.run("postgres", f"ALTER DATABASE {name} SET {limit}")
+        store.engines.dispose()
+        with pytest.raises(StoreUnavailable, match=f"not available now .*{reason}"):
+            _run(store, "SELECT pg_sleep(0.1)", "DELETE FROM claims")
+        postgres_server.run("postgres", f"ALTER DATABASE {name} RESET {name}")
+        assert store.put([window()]) == [PutResult.NEW]
+        _run(store, "SELECT pg_sleep(0.1)")
+
+
+def _run(store: Store, *statements: str) -> None:
+    with transaction(store.engines.writer) as connection:
+        for statement in statements:
+            connection.exec_driver_sql(statement)
 
 
 @pytest.mark.slow

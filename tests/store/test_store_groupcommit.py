@@ -1,5 +1,6 @@
 """Group commit: few transactions, results only once they are safe, and recovery from every failure."""
 
+import asyncio
 import os
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ from store_cases import letter, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import StoreBusy, StoreUnavailable, transaction
-from servotwin.store.group_commit import CommitLimits, GroupCommit
+from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import EvidenceRecord, Incoming, PutResult, WorkResult
 from servotwin.store.store import Store, open_store
 
@@ -240,6 +241,33 @@ def test_a_read_only_database_is_survived(store: Store, group: GroupCommit) -> N
         assert connection.exec_driver_sql("SELECT count(*) FROM messages").scalar_one() == 0
     store.engines.writer.dispose()
     assert results([group.put(window())]) == [PutResult.NEW]
+
+
+def test_results_that_cannot_be_written_are_a_failure_although_messages_can(store: Store, group: GroupCommit) -> None:
+    """As without a right on a table of results: the store counted as available, at each window anew."""
+    now = 1000.0
+
+    async def write(writes: AwaitedCommits) -> None:
+        nonlocal now
+        await writes.put(window())
+        (claim,) = store.lease("me", 1, 60.0, 200.0)
+        _break(store, "evidence")
+        work = outcome(claim, EvidenceRecord("estimate", 1, b""))
+        with pytest.raises(StoreUnavailable):
+            await writes.commit(work)
+        now += 1.0
+        await writes.put(window(sequence=2))
+        assert (writes.failed_at, "evidence" in writes.failure) == (1000.0, True)
+        now += 60.0  # as where another process has done that work
+        await writes.put(window(sequence=3))
+        assert writes.failure == ""
+
+    asyncio.run(write(AwaitedCommits(group, lambda: now)))
+
+
+def _break(store: Store, table: str) -> None:
+    with transaction(store.engines.writer) as connection:
+        connection.exec_driver_sql(f"ALTER TABLE {table} RENAME TO another")
 
 
 def test_a_lost_connection_is_survived(store: Store, group: GroupCommit) -> None:
