@@ -18,9 +18,10 @@ from servotwin.runtime.files import atomic_output
 from servotwin.runtime.sqlite_damage import damage_words
 from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
 from servotwin.store.integrity import STORED_BODIES, body_fault
-from servotwin.store.migrate import VERSIONS
+from servotwin.store.migrate import VERSIONS, checked_revision
 from servotwin.store.outgoing import fresh_serial
-from servotwin.store.schema import REVISION
+from servotwin.store.schema import REVISION, metadata
+from servotwin.store.stored_value import WrongType, wrong_value
 
 PAGES = 2048
 """Pages copied between two progress reports."""
@@ -168,6 +169,9 @@ def _fault_of(copy: sqlite3.Connection) -> str:
     (result,) = copy.execute("PRAGMA integrity_check(1)").fetchone()
     if result != "ok":
         return str(result).splitlines()[-1]  # the lines before tell the database, which is `main`
+    for table in metadata.sorted_tables:
+        if fault := wrong_value(copy, table):
+            return fault
     faults = (body_fault(*row) for row in copy.execute(str(STORED_BODIES)))
     try:
         return next(filter(None, faults), "")
@@ -210,7 +214,11 @@ def _check_revision(connection: sqlite3.Connection, path: Path) -> None:
     # Not all tables of today: a backup of an earlier revision lacks the later ones, which the upgrade makes.
     if not _tables(connection) >= {VERSIONS, *RowCounts._fields}:
         raise InvalidInput(f"store {path}: is not a store of servotwin")
-    (revision,) = connection.execute(f"SELECT version_num FROM {VERSIONS}").fetchone()
+    named = connection.execute(f"SELECT version_num FROM {VERSIONS}").fetchone()
+    try:
+        revision = checked_revision(named and named[0])
+    except WrongType as error:
+        raise InvalidInput(f"store {path}: is damaged ({error})") from None
     if revision > REVISION:
         raise InvalidInput(f"store {path}: its schema {revision} is newer than {REVISION}, the newest known here")
 

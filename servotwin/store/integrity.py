@@ -25,6 +25,7 @@ from servotwin.store.migrate import VERSIONS
 from servotwin.store.postgresql_tables import table_faults
 from servotwin.store.schema import WINDOWS, bodies, messages, metadata
 from servotwin.store.store import Store
+from servotwin.store.stored_value import wrong_value
 
 log = logging.getLogger(__name__)
 
@@ -124,6 +125,8 @@ def check_pages(
             for table in _TABLES:
                 rows = connection.execute(f"PRAGMA {check}('{table}')").fetchmany(_MOST_FAULTS)
                 faults = tuple(f"table {table}: {row[0].splitlines()[-1]}" for row in rows if row[0] != "ok")
+                if not faults and table in metadata.tables:
+                    faults = tuple(filter(None, [wrong_value(connection, metadata.tables[table])]))
                 if faults:
                     return IntegrityReport(faults, False, checked)
                 checked += 1

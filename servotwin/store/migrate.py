@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import POSTGRESQL, public_address, transaction
 from servotwin.store.schema import REVISION, metadata
+from servotwin.store.stored_value import WrongType
 
 log = logging.getLogger(__name__)
 
+_REVISION = re.compile("[0-9]{4}")
 VERSIONS = "servotwin_version"
 """Name of the table that holds the revision."""
 _OUTBOXS_TABLES = {"windows", "letters", "acknowledged"}
@@ -62,7 +66,15 @@ def _revision(connection: sa.Connection) -> str | None:
     """Read the revision of a database; None: an empty one."""
     if not sa.inspect(connection).has_table(VERSIONS):
         return None
-    return connection.execute(sa.text(f"SELECT version_num FROM {VERSIONS}")).scalar()
+    return checked_revision(connection.execute(sa.text(f"SELECT version_num FROM {VERSIONS}")).scalar())
+
+
+def checked_revision(revision: Any) -> str:
+    """Return the revision that a database names; raises WrongType where it is none."""
+    if isinstance(revision, str) and _REVISION.fullmatch(revision):
+        return revision
+    held = "nothing" if revision is None else "bytes" if isinstance(revision, bytes) else repr(revision)
+    raise WrongType(f"column {VERSIONS}.version_num holds {held} where the four digits of a schema belong")
 
 
 def _check(connection: sa.Connection, current: str | None, to: str) -> None:

@@ -18,6 +18,9 @@ _BITMAP = "enable_bitmapscan"
 """Plans that read an index in its order, plans that read the table in its own, and one that reads both."""
 _SOUGHT_PERCENT = 5.0
 """Share of the rows that are sought by each index in a bounded time: a page above its leaves leads to thousands."""
+_COLUMNS = sa.text(
+    "SELECT table_name, column_name, data_type FROM information_schema.columns WHERE table_schema = current_schema()"
+)
 _CANCELED = "57014"
 _LEAST_MS = 1
 
@@ -44,13 +47,28 @@ def table_faults(engine: sa.Engine, seconds: float) -> tuple[tuple[str, ...], bo
         with transaction(engine.execution_options(isolation_level="REPEATABLE READ")) as connection:
             known = set(sa.inspect(connection).get_table_names())
             missing = tuple(f"table {name}: is missing" for name in metadata.tables if name not in known)
-            return missing or _lost_references(connection, until) or _lost_rows(connection, until), True
+            faults = missing or _wrong_columns(connection) or _lost_references(connection, until)
+            return faults or _lost_rows(connection, until), True
     except StoreDamaged as error:
         return (str(error),), False
     except StoreUnavailable as error:
         if getattr(error.__cause__, "sqlstate", None) != _CANCELED:
             raise
         return (), False
+
+
+def _wrong_columns(connection: sa.Connection) -> tuple[str, ...]:
+    """Columns of another type: comparing and computing with their values fails, or means something else."""
+    found = connection.execute(_COLUMNS)
+    types = {(row.table_name, row.column_name): row.data_type for row in found}
+    faults = []
+    for table in metadata.sorted_tables:
+        for column in table.columns:
+            made = column.type.compile(connection.dialect).lower()
+            there = types.get((table.name, column.name), made)
+            if there != made:
+                faults.append(f"column {table.name}.{column.name} is of type {there}, and was made as {made}")
+    return tuple(faults)
 
 
 def _lost_references(connection: sa.Connection, until: float) -> tuple[str, ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
+from servotwin.store.stored_value import check_values
+
 REVISION = "0004"
 """Newest migration, which makes the tables below."""
 
@@ -139,3 +141,5 @@ _index("ix_twins_estimate_ready", twins.c.estimate_ready, where=twins.c.estimate
 _index("ix_twins_wake", twins.c.wake, where=twins.c.wake.is_not(None))
 _index("ix_evidence_message", evidence.c.message)
 _index("ix_evidence_version", evidence.c.servo, evidence.c.kind, evidence.c.version, evidence.c.id)
+
+check_values(metadata)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import StoreDamaged, StoreUnavailable
 
 _Result = TypeVar("_Result")
 _THREADS = 4
@@ -27,12 +27,14 @@ class StoreExecutor:
     ----------
     fault : str
         Why the last call failed; empty: it succeeded.
+    damage : str
+        Damage that a call found; empty: none since it was last emptied.
     """
 
     def __init__(self, threads: int = _THREADS, name: str = "store") -> None:
         self._threads = ThreadPoolExecutor(threads, name)
         self._begun = dict[object, float]()
-        self.fault = ""
+        self.fault = self.damage = ""
 
     @property
     def waited(self) -> float:
@@ -48,6 +50,8 @@ class StoreExecutor:
             result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
         except StoreUnavailable as error:
             self.fault = str(error)
+            if isinstance(error, StoreDamaged):
+                self.damage = self.fault
             raise
         finally:
             self._begun.pop(mark, None)

@@ -147,6 +147,8 @@ class StoreWatch:
         pause = _RECHECK_S
         while True:
             await asyncio.sleep(_TELL_S)
+            if self._executor.damage:
+                self._found(IntegrityReport((self._executor.damage,), False))
             if not self.fault:
                 pause = _RECHECK_S
                 continue
@@ -182,7 +184,7 @@ class StoreWatch:
     def _resume(self) -> None:
         """Write the store again, over connections that have read none of what was damaged."""
         self._store.engines.dispose()
-        self.fault, self._store.damaged = "", False
+        self.fault, self._executor.damage, self._store.damaged = "", "", False
         log.warning("store sound again: it is written", extra={"after": self._why})
         self._compare_mark()
 

@@ -16,6 +16,8 @@ from servotwin.store import engine
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
 
+COMMANDS = ["twin check", "servos", "audit ax-1", "replay ax-1", "backup b.db"]
+
 
 @pytest.mark.parametrize("command", [["audit", "ax-1"], ["audit", "ax-1", "--json"], ["replay", "ax-1"]])
 def test_a_damaged_store_is_one_sentence(tmp_path: Path, command: list[str]) -> None:
@@ -146,6 +148,40 @@ def test_a_text_that_is_none_is_said_as_damage_without_its_bytes(tmp_path: Path,
     assert result.exit_code == INVALID
     assert re.match(r"error: store .*: is damaged \(a text in column '\w+' is not UTF-8\)", result.stderr)
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("twins SET gap = 'abc'", "column twins.gap holds a text where a number belongs"),
+        ("messages SET encoding = x'ff'", "column messages.encoding holds bytes where a text belongs"),
+        ("messages SET sequence = 1.5", "column messages.sequence holds a number where a whole number belongs"),
+        ("bodies SET body = 'abc'", "column bodies.body holds a text where bytes belong"),
+        (
+            "servotwin_version SET version_num = x'ff'",
+            "column servotwin_version.version_num holds bytes where the four digits of a schema belong",
+        ),
+        (
+            "servotwin_version SET version_num = 'abc'",
+            "column servotwin_version.version_num holds 'abc' where the four digits of a schema belong",
+        ),
+    ],
+)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_value_of_another_type_is_said_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, change: str, why: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    store = open_store(str(file))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    with closing(sqlite3.connect(file)) as writer:
+        writer.execute(f"UPDATE {change}")
+        writer.commit()
+    result = CliRunner().invoke(app, [*command.split(), "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert re.fullmatch(rf"error: store .*: is damaged \((.*is damaged \()?{why}\)+.*\n", result.stderr)
 
 
 def test_output_that_is_no_terminal_has_no_empty_line_for_the_progress(tmp_path: Path) -> None:

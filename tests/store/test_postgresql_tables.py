@@ -19,7 +19,7 @@ from waiting import until
 
 from servotwin.errors import InvalidInput
 from servotwin.store import engine
-from servotwin.store.engine import StoreUnavailable, parse_address
+from servotwin.store.engine import StoreDamaged, StoreUnavailable, parse_address
 from servotwin.store.integrity import check_pages
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.store import Store, open_store
@@ -178,6 +178,27 @@ def test_a_check_of_tables_ends_in_time_and_says_so(filled: Store) -> None:
 def test_a_table_that_is_gone_is_damage(filled: Store) -> None:
     run(filled, "DROP TABLE outgoing")
     assert check_pages(filled, math.inf).faults == ("table outgoing: is missing",)
+
+
+@pytest.mark.parametrize(
+    ("column", "kind", "made"),
+    [("messages.received", "text", "double precision"), ("messages.sequence", "text", "bigint")],
+)
+def test_a_column_of_another_type_is_damage(filled: Store, column: str, kind: str, made: str) -> None:
+    """Workers ended one after the other, and a task of the service did, since a time was a text."""
+    table, name = column.split(".")
+    run(filled, f"ALTER TABLE {table} ALTER {name} TYPE {kind} USING {name}::{kind}")
+    filled.engines.dispose()
+    assert check_pages(filled, math.inf).faults == (f"column {column} is of type {kind}, and was made as {made}",)
+    with pytest.raises(StoreDamaged, match=f"column {column} holds a text where a (whole )?number belongs"):
+        filled.audit("a")
+
+
+def test_a_column_that_takes_no_value_of_its_own_type_makes_a_store_not_available(filled: Store) -> None:
+    run(filled, "ALTER TABLE messages ALTER key TYPE bytea USING key::bytea")
+    filled.engines.dispose()
+    with pytest.raises(StoreUnavailable, match="not available now"):
+        filled.put([window(sequence=9)])
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import sqlite3
 from contextlib import closing, suppress
 
 import pytest
-from service_system import twin_file
+from service_system import OPERATOR, bearer, twin_file
 from store_cases import postgresql_addresses
 from watched_store import posted, send, serve, until
 
@@ -141,6 +141,32 @@ def test_damage_that_comes_later_is_noticed_by_the_digest_of_a_body(tmp_path):
         assert system.watch.rounds >= 1
 
     serve(twin_file(tmp_path), body)
+
+
+def test_a_value_of_another_type_that_is_read_is_damage_until_it_is_gone(tmp_path, monkeypatch):
+    """Nothing noticed it but those who read: it ended workers and tasks of the service."""
+    monkeypatch.setattr(store_watch, "_TELL_S", 0.01)
+    monkeypatch.setattr(store_watch, "_RECHECK_S", 0.01)
+
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        change(system, "UPDATE twins SET gap = 'abc'")
+        answer = await client.get("/v1/servos", headers=bearer(OPERATOR))
+        assert answer.status_code == 503
+        await until(lambda: system.watch.fault)
+        damage = (await client.get("/healthz")).json()["damage"]
+        assert "column twins.gap holds a text where a number belongs" in damage
+        assert await send(client, 1) == [503]
+        change(system, "UPDATE twins SET gap = NULL")
+        await until(lambda: not system.watch.fault)
+        assert await send(client, 1) == [201]
+
+    serve(twin_file(tmp_path), body)
+
+
+def change(system, statement):
+    with system.store.engines.writer.begin() as connection:
+        connection.exec_driver_sql(statement)
 
 
 def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_path, caplog):
