@@ -51,9 +51,10 @@ _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 _SQL_DAMAGE = ("XX001", "XX002")
 _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
-_NOT_AS_MADE = ("3F000", "42P01", "42703", "42501", "42804", "42883")
-"""SQLSTATE of a schema, table or column that is not there, of a right that was taken away, and of a column of another
-type: the driver counts them among faults of the statement, but the same statements worked before."""
+_NOT_AS_MADE = ("3F000", "42P01", "42703", "42501", "42804", "42883", "2200H", "P0001")
+"""SQLSTATE of a schema, table or column that is not there, of a right that was taken away, of a column of another type,
+of numbers of rows that are used up, and of a trigger's own error: the driver counts them among faults of the statement,
+but the same statements worked before."""
 _OF_THE_SESSION = ("25006", "57014")
 """SQLSTATE of a write in a read-only transaction, and of a statement that took too long: a session keeps the limits of
 its beginning for ever, though the database has other ones meanwhile."""

@@ -26,6 +26,11 @@ from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
 
+TRIGGER = """
+CREATE FUNCTION no() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN RAISE EXCEPTION 'not today'; END $$;
+CREATE TRIGGER no BEFORE INSERT ON messages FOR EACH ROW EXECUTE FUNCTION no()
+"""
+
 
 @pytest.fixture
 def filled(postgres_server: postgres.Server) -> Iterator[Store]:
@@ -194,8 +199,16 @@ def test_a_column_of_another_type_is_damage(filled: Store, column: str, kind: st
         filled.audit("a")
 
 
-def test_a_column_that_takes_no_value_of_its_own_type_makes_a_store_not_available(filled: Store) -> None:
-    run(filled, "ALTER TABLE messages ALTER key TYPE bytea USING key::bytea")
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "ALTER TABLE messages ALTER key TYPE bytea USING key::bytea",
+        "ALTER SEQUENCE messages_id_seq MAXVALUE 3",
+        TRIGGER,
+    ],
+)
+def test_a_table_that_takes_no_more_rows_makes_a_store_not_available(filled: Store, statement: str) -> None:
+    run(filled, statement)
     filled.engines.dispose()
     with pytest.raises(StoreUnavailable, match="not available now"):
         filled.put([window(sequence=9)])
