@@ -12,8 +12,8 @@ from servotwin.config.keys import replaced
 from servotwin.control.law import release_of
 from servotwin.control.linear_tick import LinearParameters, LinearState, linear_transfer
 from servotwin.control.matrices import Rows, at_rest, zero_order_held
+from servotwin.control.system_matrices import system_matrices
 from servotwin.errors import InvalidInput
-from servotwin.runtime.extras import require
 
 INPUTS = ("reference", "y_motor", "y_load")
 MOTOR, LOAD = "motor", "load"
@@ -59,7 +59,8 @@ class LinearLaw:
     feedforward : float
         Always added to the command.
     release_time : float, optional
-        Time constant with which the offset after a change of the law fades, s; 0.5 s where absent.
+        Time constant with which the offset after a change of the law fades, s; where absent that of its axis
+        (`plant.release`), 0.5 s without one.
     gain : float
         Factor on the whole law.
     integral_share : float
@@ -159,7 +160,7 @@ class LinearLaw:
         InvalidInput
             Another kind of object, other numbers of inputs or outputs, or a sampled system without a sample time.
         """
-        A, B, C, D, step = _matrices(system)
+        A, B, C, D, step = system_matrices(system)
         columns = {1: ((1.0,), (-1.0,)), 2: ((1.0, 0.0), (0.0, 1.0))}
         if len(C) != 1 or len(D[0]) not in (1, 2, 3):
             raise InvalidInput(
@@ -390,17 +391,3 @@ def _numbers(name: str, given: Any, shape: tuple[int, ...]) -> Any:
         if not isfinite(value):
             raise InvalidInput(f"law {name} = {rows!r}: all {size} numbers must be finite")
     return found
-
-
-def _matrices(system: Any) -> tuple[list[Any], list[Any], list[Any], list[Any], float | None]:
-    """Matrices of a system of scipy.signal or python-control, row by row, and its sample time."""
-    if hasattr(system, "to_ss"):
-        system = system.to_ss()
-    elif type(system).__module__.startswith("control") and not hasattr(system, "A"):
-        system = require("control", "a python-control system").ss(system)
-    if not all(hasattr(system, name) for name in "ABCD"):
-        raise InvalidInput(f"law system = {system!r}: must be a system of scipy.signal or python-control")
-    if (step := getattr(system, "dt", None)) is True:
-        raise InvalidInput("law system dt = True: a sampled system needs its sample time in s")
-    A, B, C, D = (getattr(system, name).tolist() for name in "ABCD")
-    return A, B, C, D, float(step) if step else None

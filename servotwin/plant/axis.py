@@ -190,9 +190,7 @@ class Axis:
     @property
     def position_resolution(self) -> float:
         """One count of the sensor that the controller reads, m (rotary: rad)."""
-        if self.at_motor:
-            return self.p * self.sensors.encoder_resolution
-        return self.sensors.position_resolution
+        return self.p * self.sensors.encoder_resolution if self.at_motor else self.sensors.position_resolution
 
     @property
     def encoder_resolution(self) -> float:
