@@ -21,6 +21,7 @@ from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.uncommitted_results import UncommittedResults
 from servotwin.twin_service.update_pace import UpdatePace
 from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerProcess
 from servotwin.twin_service.worker_pool import WorkerPool
@@ -98,7 +99,7 @@ class Dispatcher:
         self._deferred, self._next_job = set[str](), 0.0
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
-        self.away, self._not_committed = "", False
+        self.away, self._not_committed, self._uncommitted = "", False, UncommittedResults()
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
         self._failures: Counter[_Queue] = Counter()
@@ -335,9 +336,10 @@ class Dispatcher:
         except StoreUnavailable as error:
             counts.add("not committed")
             self._not_committed = True
-            log.error("result not committed", extra={"servo": result.servo, "why": str(error)})
+            self._uncommitted.failed(self._clocks.monotonic(), servo=result.servo, why=str(error))
             self._to_release.add(result.servo)
             return False
+        self._uncommitted.over()
         # A void result has no lease to release: the result before it ended that, and its present owner needs it.
         counts.add("committed" if valid else "void")
         if valid and result.outgoing:
