@@ -22,7 +22,7 @@ from servotwin.store.engine import (
     transaction,
 )
 from servotwin.store.incoming import insert_once
-from servotwin.store.migrate import is_newest, migrate
+from servotwin.store.migrate import VERSIONS, is_newest, migrate
 from servotwin.store.records import (
     Backlog,
     Incoming,
@@ -43,6 +43,7 @@ WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.ACT)
 _FLEET = "fleet"
 """Key of the fleet's name among the contexts, whose other keys are digests."""
 _RACES = 8
+_NOTHING = sa.text(f"UPDATE {VERSIONS} SET version_num = version_num")
 
 _Result = TypeVar("_Result")
 
@@ -265,6 +266,14 @@ class Store:
     def reading(self, action: Callable[[sa.Connection], _Result]) -> _Result:
         """Run a query, such as those of `overview`, in a transaction that reads; raises StoreUnavailable."""
         return self._read(action)
+
+    def write_nothing(self) -> None:
+        """Commit a row as it is; raises StoreUnavailable where the database cannot be written.
+
+        Nothing less tells: SQLite begins a transaction on a disk that is full or read-only, and a database that nobody
+        writes looks healthy.
+        """
+        self._write(lambda connection: connection.execute(_NOTHING))
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:

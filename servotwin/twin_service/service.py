@@ -220,6 +220,7 @@ class TwinService:
         self._spawn(self._clock.tell(self._announce), vital=False)
         self._spawn(self.wrong_tokens.watch(self._announce), vital=False)
         self._spawn(self._store_health.watch(self._announce), vital=False)
+        self._spawn(self._store_health.run_write(self.store.write_nothing), vital=False)
         self._spawn(self.pages.feed.run(), vital=False)
         self._spawn(self.pages.what_if.run())
         if self.webhook is not None:
@@ -366,11 +367,8 @@ class TwinService:
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
         unauthenticated = self.unauthenticated
         if unauthenticated is not None:
-            add(
-                "servotwin_unauthenticated_connections",
-                "Connections that have shown no token.",
-                lambda: unauthenticated.open,
-            )
+            shown = "Connections that have shown no token."
+            add("servotwin_unauthenticated_connections", shown, lambda: unauthenticated.open)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.pages.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)

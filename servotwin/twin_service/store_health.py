@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable
 
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits
 from servotwin.twin_service.store_executor import StoreExecutor
 
@@ -23,6 +24,8 @@ connection alive for ever, and nobody else would end the wait. A working server 
 _LOOK_S, _LASTS_S, _OVER_S = 1.0, 5.0, 10.0
 """s between two looks; after which trouble is no moment's, and posted; without trouble after which it is over: on a
 full disk reads succeed between writes that fail."""
+_WRITE_S = 15.0
+"""s between two writes that only tell that the store can be written: without edges that send nothing else would."""
 
 
 class StoreHealth:
@@ -57,6 +60,7 @@ class StoreHealth:
         self._logged = set[str]()
         self._posted, self._since, self._seen = False, 0.0, -math.inf
         self._damage_seen = -math.inf
+        self._not_written = ""
 
     @property
     def trouble(self) -> str:
@@ -67,7 +71,7 @@ class StoreHealth:
         # A write that failed because of damage says nothing once that is over; damage is looked at every second.
         since = max(self._now() - _UNHEALTHY_S, self._damage_seen + _LOOK_S)
         failed = self._writes.failure if self._writes.failed_at > since else ""
-        return self._leases() or failed or self._executor.fault or self._stalled()
+        return self._leases() or failed or self._not_written or self._executor.fault or self._stalled()
 
     @property
     def _waited(self) -> float:
@@ -104,3 +108,18 @@ class StoreHealth:
         while True:
             self.look(announce)
             await asyncio.sleep(_LOOK_S)
+
+    async def run_write(self, write: Callable[[], None]) -> None:
+        """Write again and again, whatever else does."""
+        while True:
+            await self.try_write(write)
+            await asyncio.sleep(_WRITE_S)
+
+    async def try_write(self, write: Callable[[], None]) -> None:
+        """Note the reason for which a write, such as `Store.write_nothing`, fails."""
+        try:
+            if not self._damage():
+                await self._executor.run(write)
+            self._not_written = ""
+        except StoreUnavailable as error:
+            self._not_written = str(error)

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import threading
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from service_system import MSGPACK, bearer, hello, served, twin_file
 
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import Backlog
+from servotwin.store.store import Store
 from servotwin.twin_service import http_operator, store_health, store_watch
 from servotwin.twin_service.store_health import StoreHealth
 
@@ -233,3 +235,26 @@ def test_reasons_that_take_turns_are_logged_once_each(caplog: pytest.LogCaptureF
             watched.looked(1)
     assert lines(caplog) == [(KIND, "no room for messages"), (KIND, "no room for bodies")]
     assert len(watched.told) == 1
+
+
+def test_a_store_that_turned_read_only_is_not_healthy_although_nobody_writes(tmp_path: Path) -> None:
+    """It looked healthy until the first window."""
+
+    async def body() -> None:
+        async with served(twin_file(tmp_path)) as (system, client):
+            assert (await client.get("/healthz")).json()["store"] is True
+            forbid(system.store, "ON")
+            await system._store_health.try_write(system.store.write_nothing)
+            assert (await client.get("/healthz")).json()["store"] is False
+            assert "attempt to write a readonly database" in system._store_health.trouble
+            forbid(system.store, "OFF")
+            await system._store_health.try_write(system.store.write_nothing)
+            assert (await client.get("/healthz")).json()["store"] is True
+
+    asyncio.run(body())
+
+
+def forbid(store: Store, state: str) -> None:
+    """Let SQLite's one writing connection refuse to write, or write again."""
+    with closing(store.engines.writer.raw_connection()) as connection:
+        connection.cursor().execute(f"PRAGMA query_only = {state}")
