@@ -9,7 +9,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from errno import EROFS
 from pathlib import Path
+from tempfile import TemporaryFile
 from threading import Lock
 from typing import Any
 from weakref import WeakSet
@@ -232,14 +234,27 @@ def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
     reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
     if reason == _LOCKED:
         reason = f"another program has kept it locked for {_BUSY_S:g} s"
-    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason}{_closed_files(engine)})")
+    return StoreUnavailable(
+        f"store {public_address(engine.url)}: not available now ({reason}{_why_not_written(engine)})"
+    )
 
 
-def _closed_files(engine: sa.Engine) -> str:
-    """Names of the files that this user may not write: SQLite tells neither that nor which; a log keeps its mode."""
+def _why_not_written(engine: sa.Engine) -> str:
+    """Reason for which nothing can be written beside an SQLite file, which SQLite itself calls an error of the disk."""
     file = sqlite_file(engine.url)
     if file is None:
         return ""
+    try:
+        with TemporaryFile(dir=file.parent):
+            return _closed_files(file)
+    except OSError as error:
+        if error.errno == EROFS:
+            return f"; the file system of {file.parent} is read-only"
+        return _closed_files(file)
+
+
+def _closed_files(file: Path) -> str:
+    """Names of the files that this user may not write: SQLite tells neither that nor which; a log keeps its mode."""
     places = [file.parent, *(file.with_name(f"{file.name}{end}") for end in ("", "-wal", "-shm"))]
     closed = [str(place) for place in places if os.access(place, os.F_OK) and not os.access(place, os.W_OK)]
     return f"; this user may not write {' and '.join(closed)}" if closed else ""

@@ -16,6 +16,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from postgres import Server
+from smalldisk import small_disk
 from store_cases import MORE, NEXT, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
@@ -331,6 +332,20 @@ def test_a_store_that_cannot_be_written_names_the_file_whose_mode_is_in_the_way(
         raise sqlite3.OperationalError("attempt to write a readonly database")
     assert str(refused.value).endswith(f"(attempt to write a readonly database; this user may not write {log})")
     store.close()
+
+
+def test_a_file_system_that_turned_read_only_is_named(tmp_path: Path) -> None:
+    """SQLite calls that an error of the disk, as it does much else."""
+    with small_disk(tmp_path / "disk", 4) as disk:
+        store = filled(f"sqlite:///{disk.path}/twin.db")
+        store.close()
+        disk.remount("ro")
+        with pytest.raises(StoreUnavailable) as refused:
+            store.write_nothing()
+        disk.remount("rw")
+        store.write_nothing()
+        store.close()
+    assert str(refused.value).endswith(f"; the file system of {disk.path} is read-only)")
 
 
 def test_a_log_whose_store_was_moved_away_is_not_deleted_by_a_new_store(url: str, tmp_path: Path) -> None:
