@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from servotwin.store.records import Lease, MessageKind, StoredMessage
+from servotwin.store.records import LONGEST_WAKE_S, Lease, MessageKind, StoredMessage
 from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, messages, states, twins
 
@@ -44,7 +44,9 @@ def acquire(
     places, and a single place goes to the servo that has waited longest for either. Of estimates one servo.
     """
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
-    bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
+    bound = {"_now": now, "_late": until + (until - now), "_ahead": _ahead(now)} | (
+        {} if only is None else {"_only": only}
+    )
     new, estimates, backlogs = _queues(frozenset(kinds), only is not None)
     order = [(new, limit, False), (estimates, 1, True), (backlogs, limit, False)]
     for queues, most, estimate in [order[1], *order] if estimate_first else order:
@@ -131,7 +133,12 @@ def load(
 
 def due(connection: sa.Connection, servos: Collection[str], now: float) -> set[str]:
     """Servos among these that are due to be woken."""
-    return set(connection.scalars(_DUE, {"_servos": list(servos), "_now": now}))
+    return set(connection.scalars(_DUE, {"_servos": list(servos), "_now": now, "_ahead": _ahead(now)}))
+
+
+def _ahead(now: float) -> float:
+    """Time after which no twin whose clock is right sets a wake-up."""
+    return now + 2.0 * LONGEST_WAKE_S
 
 
 _Queue = tuple[sa.Select[Any], float]
@@ -143,7 +150,7 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> tuple[list[_Queue], lis
     """Queues of new messages, which share the places, of estimates, and of backlogs; of `one` servo only."""
     new, estimates, backlogs = list[_Queue](), list[_Queue](), list[_Queue]()
     if kinds - {MessageKind.VERIFICATION}:
-        due, ready, estimate = twins.c.wake <= _NOW, twins.c.ready <= _NOW, twins.c.estimate_ready.is_not(None)
+        due, ready, estimate = _IS_DUE, twins.c.ready <= _NOW, twins.c.estimate_ready.is_not(None)
         # Half of the places at most before those with messages, the rest after them: neither queue can starve the
         # other.
         woken = _next(due, twins.c.wake, one)
@@ -225,7 +232,9 @@ def _few_messages(kinds: frozenset[MessageKind], newest: bool) -> sa.Select[Any]
 _NOBODY = "nobody"
 """Owner of the leases that only hold a servo."""
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
-_NOW = sa.bindparam("_now", type_=sa.Double)
+_NOW, _AHEAD = (sa.bindparam(name, type_=sa.Double) for name in ("_now", "_ahead"))
+# Where a clock was set back since, nothing else would wake a servo until it has caught up.
+_IS_DUE = sa.or_(twins.c.wake <= _NOW, twins.c.wake > _AHEAD)
 
 _LEASE = RowStatement(
     lambda _: (
@@ -243,4 +252,4 @@ _STATES = (
     .outerjoin(states, states.c.servo == twins.c.servo)
     .where(twins.c.servo.in_(_SERVOS))
 )
-_DUE = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), twins.c.wake <= _NOW)
+_DUE = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), _IS_DUE)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
+LONGEST_WAKE_S = 60.0
+"""s from the work until the servo's next wake-up, at most; one that is more than twice that ahead was set under a clock
+that was ahead, and is due."""
+
 
 class MessageKind(StrEnum):
     """Kind of an incoming message, as stored in `messages.kind`."""
@@ -156,7 +160,7 @@ class WorkResult(NamedTuple):
         The lease's: a result that was committed since then voids this one.
     state : bytes
     wake : float or None
-        s since the epoch at which the twin is to be woken.
+        s since the epoch at which the twin is to be woken, within LONGEST_WAKE_S.
     done : tuple of int
         Ids of the messages that it covers.
     evidence : tuple of EvidenceRecord

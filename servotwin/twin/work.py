@@ -19,7 +19,16 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
 from servotwin.messages.acts import Act, ActKind, decode_act
 from servotwin.messages.codec import decompress
-from servotwin.store.records import TOO_LATE, EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import (
+    LONGEST_WAKE_S,
+    TOO_LATE,
+    EvidenceRecord,
+    Incoming,
+    Lease,
+    MessageKind,
+    StoredMessage,
+    WorkResult,
+)
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import ActRecord
 from servotwin.twin.evidence_rows import failure_row, rows
@@ -110,7 +119,7 @@ class _Worker:
             self.lease.servo,
             self.lease.serial,
             encode_state(self.state),
-            next_wake(self.model, self.state) if woken else None,
+            self._next_wake(now) if woken else None,
             tuple(stored.id for stored in batch if stored.id != self.deferred),
             tuple(self.evidence),
             tuple(messages.encode(message) for message in self.sent),
@@ -118,6 +127,11 @@ class _Worker:
             contexts=(self.context,) if any(row.context for row in self.evidence) else (),
             deferred=self.deferred if any(stored.kind is MessageKind.WINDOW for stored in batch) else None,
         )
+
+    def _next_wake(self, now: float) -> float | None:
+        """Time of the next wake-up, which may come before anything is due: the store doubts a later one."""
+        due = next_wake(self.model, self.state)
+        return None if due is None else min(due, now + LONGEST_WAKE_S)
 
     def _restored(self, now: float) -> tuple[TwinModel, TwinState]:
         """Restore the twin from the last result.

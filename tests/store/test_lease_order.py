@@ -45,6 +45,18 @@ def test_a_servo_is_leased_when_its_wake_up_is_due(store: Store) -> None:
     assert (woken.servo, woken.messages) == ("a", ())
 
 
+def test_a_wake_up_that_was_set_under_a_clock_far_ahead_is_due_once_the_clock_is_right(store: Store) -> None:
+    """The twin's repetition of an update, or of a request, waited until then."""
+    store.put([window(), window("b")])
+    year = 365.0 * 86400.0
+    store.commit([outcome(one, wake=year + 5.0) for one in claim(store)], year)
+    woken = claim(store, limit=1, now=300.0) + claim(store, now=300.0)
+    assert [(one.servo, one.messages) for one in woken] == [("a", ()), ("b", ())]
+    store.commit([outcome(one, wake=305.0) for one in woken], 300.0)
+    assert claim(store, now=304.0) == []
+    assert len(claim(store, now=305.0)) == 2
+
+
 def test_servos_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Store) -> None:
     for servo in ("w1", "w2", "w3"):
         store.put([window(servo)])

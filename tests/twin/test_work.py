@@ -228,6 +228,14 @@ def test_a_clock_that_is_put_back_holds_nothing_up():
     assert work(asks, claim(state=back.state), 55.0).outgoing == first.outgoing
 
 
+def test_a_servo_is_woken_within_a_minute_although_nothing_is_due_before_an_hour():
+    """Of a wake-up that is further ahead the store thinks that it was set under another clock."""
+    first = work(fleet(retry=3600.0), claim(windows()[1]), 50.0)
+    again = work(fleet(retry=3600.0), claim(state=first.state), 110.0)
+    assert first.wake == 110.0
+    assert (again.outgoing, again.wake) == ((), 170.0)
+
+
 def test_a_clock_that_is_put_forward_sends_again_once():
     first = work(fleet(), claim(windows()[1]), 50.0)
     after = work(fleet(), claim(state=first.state), 1e9)
