@@ -12,6 +12,7 @@ from pathlib import Path
 
 from servotwin.cli.output import progress_bar
 from servotwin.errors import InvalidInput
+from servotwin.store.encoded_contents import encoding_faults
 from servotwin.store.engine import POSTGRESQL, SQLITE, StoreUnavailable
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
 from servotwin.store.store import Store
@@ -36,6 +37,7 @@ def check_store(config: Path) -> None:
     with closing(open_existing_store(service_of(config))) as store:
         _require_whole(store, config, math.inf)
         checked = _check_bodies(store)
+        _require_sound(store, IntegrityReport(encoding_faults(store)))
         print(f"store {store.name}: is sound ({checked} messages agree with their digests)")
 
 

@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from servotwin.store.engine import StoreDamaged, StoreUnavailable, transaction
 from servotwin.store.schema import metadata
+from servotwin.store.stored_value import wrong_content
 
 _BY_INDEX = ("enable_indexscan", "enable_indexonlyscan")
 _BY_TABLE = ("enable_seqscan", "enable_sort")
@@ -47,7 +48,12 @@ def table_faults(engine: sa.Engine, seconds: float) -> tuple[tuple[str, ...], bo
         with transaction(engine.execution_options(isolation_level="REPEATABLE READ")) as connection:
             known = set(sa.inspect(connection).get_table_names())
             missing = tuple(f"table {name}: is missing" for name in metadata.tables if name not in known)
-            faults = missing or _wrong_columns(connection) or _lost_references(connection, until)
+            faults = (
+                missing
+                or _wrong_columns(connection)
+                or _wrong_contents(connection)
+                or _lost_references(connection, until)
+            )
             return faults or _lost_rows(connection, until), True
     except StoreDamaged as error:
         return (str(error),), False
@@ -69,6 +75,10 @@ def _wrong_columns(connection: sa.Connection) -> tuple[str, ...]:
             if there != made:
                 faults.append(f"column {table.name}.{column.name} is of type {there}, and was made as {made}")
     return tuple(faults)
+
+
+def _wrong_contents(connection: sa.Connection) -> tuple[str, ...]:
+    return tuple(filter(None, (wrong_content(connection, table) for table in metadata.sorted_tables)))
 
 
 def _lost_references(connection: sa.Connection, until: float) -> tuple[str, ...]:

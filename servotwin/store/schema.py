@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-from servotwin.store.stored_value import check_values
+from servotwin.store.records import MessageKind
+from servotwin.store.stored_value import TIME, Content, check_values
 
 REVISION = "0004"
 """Newest migration, which makes the tables below."""
@@ -142,4 +143,9 @@ _index("ix_twins_wake", twins.c.wake, where=twins.c.wake.is_not(None))
 _index("ix_evidence_message", evidence.c.message)
 _index("ix_evidence_version", evidence.c.servo, evidence.c.kind, evidence.c.version, evidence.c.id)
 
-check_values(metadata)
+_TIMES = (
+    "ready", "verification_ready", "estimate_ready", "wake", "last_message", "lease_until", "received", "done",
+    "created",
+)  # fmt: skip
+_KINDS = Content(f"one of {', '.join(MessageKind)}", texts=tuple(kind.value for kind in MessageKind))
+check_values(metadata, dict.fromkeys(_TIMES, TIME) | {"messages.kind": _KINDS})

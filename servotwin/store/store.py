@@ -40,7 +40,7 @@ from servotwin.store.records import (
 from servotwin.store.schema import contexts
 
 WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.ACT)
-_FLEET = "fleet"
+FLEET = "fleet"
 """Key of the fleet's name among the contexts, whose other keys are digests."""
 _RACES = 8
 _NOTHING = sa.text(f"UPDATE {VERSIONS} SET version_num = version_num")
@@ -209,11 +209,11 @@ class Store:
 
     def fleet(self, name: str) -> str:
         """Name of the fleet whose servos the store holds: the first one that was ever given."""
-        if _FLEET not in (known := self.contexts([_FLEET])):
-            noted = {"key": _FLEET, "text": name}
+        if FLEET not in (known := self.contexts([FLEET])):
+            noted = {"key": FLEET, "text": name}
             self._write(lambda connection: connection.execute(insert_once(connection.dialect.name, contexts), noted))
-            known = self.contexts([_FLEET])
-        return known[_FLEET]
+            known = self.contexts([FLEET])
+        return known[FLEET]
 
     def window(self, servo: str, boot: str, sequence: int) -> StoredMessage | None:
         """A window with its body, which is empty once retention deleted it; None: it is unknown."""

@@ -1,16 +1,16 @@
-"""Types of the columns, which check each value that is read: SQLite keeps a value of any type in any column."""
+"""Types of the columns, which check each value that is read: SQLite keeps a value of any type in any column, and a
+number that counts nothing, or a time that no clock shows, makes whoever computes with it fail."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
 _BYTES = "bytes"
 _NAMES = {float: "a number", int: "a whole number", str: "a text", bytes: _BYTES}
-_SQLITE_NAMES = {"real": "a number", "integer": "a whole number", "text": "a text", "blob": _BYTES}
 _STORED = {
     float: "('real', 'integer', 'null')",
     int: "('integer', 'null')",
@@ -21,7 +21,30 @@ _STORED = {
 
 
 class WrongType(Exception):
-    """A value of another type than its column's was read. One clause."""
+    """A value was read that does not belong into its column, of another type or content. One clause."""
+
+
+class Content(NamedTuple):
+    """Contents of a column: numbers from `least` to `most`, or, where there are some, one of `texts`."""
+
+    words: str
+    least: float = 0
+    most: float = 0
+    texts: tuple[str, ...] = ()
+
+    def test(self, value: Any) -> bool:
+        """Test a value of the column's own type."""
+        return value in self.texts if self.texts else self.least <= value <= self.most
+
+    def sql(self, column: str) -> str:
+        """Condition in SQL for a value that does not belong there; a NaN of PostgreSQL is above all numbers."""
+        if self.texts:
+            return f"{column} NOT IN ({', '.join(map(repr, self.texts))})"
+        return f"{column} NOT BETWEEN {self.least!r} AND {self.most!r}"
+
+
+_COUNT = Content("a count up to 2**53", 0, 2**53)
+TIME = Content("a time, in s since the epoch, before the year 10000", 0.0, 253402300799.0)
 
 
 class StoredValue(sa.TypeDecorator[Any]):
@@ -33,15 +56,16 @@ class StoredValue(sa.TypeDecorator[Any]):
         Type of the column.
     column : str
         TABLE.COLUMN.
+    content : Content, optional
     """
 
     impl: sa.types.TypeEngine[Any] | type[sa.types.TypeEngine[Any]] = sa.types.NullType
     cache_ok = True
 
-    def __init__(self, type_: sa.types.TypeEngine[Any], column: str) -> None:
+    def __init__(self, type_: sa.types.TypeEngine[Any], column: str, content: Content | None = None) -> None:
         super().__init__()
         self.impl = type_
-        self.column = column
+        self.column, self.content = column, content
 
     @property
     def kind(self) -> type:
@@ -50,47 +74,86 @@ class StoredValue(sa.TypeDecorator[Any]):
 
     def result_processor(self, _dialect: sa.Dialect, _coltype: object) -> Callable[[Any], Any]:
         """Return the check; the drivers of both systems give Python's own types."""
-        kind, column = self.kind, self.column
+        kind, column, content = self.kind, self.column, self.content
         wanted = (float, int) if kind is float else (kind,)
 
         def check(value: Any) -> Any:
-            if value is None or type(value) in wanted:
+            if value is None or (type(value) in wanted and (content is None or content.test(value))):
                 return value
-            held = _NAMES.get(type(value), f"a value of type {type(value).__name__}")
-            raise WrongType(wrong_type(column, held, _NAMES[kind]))
+            raise WrongType(_clause(column, kind, content, value))
 
         return check
 
 
 def wrong_value(connection: sqlite3.Connection, table: sa.Table) -> str:
-    """First value of another type in a table of an SQLite file, of any revision, in a clause; empty: there is none."""
+    """First value that does not belong into its column of an SQLite file, of any revision, in a clause; empty: none."""
     known = {row[1] for row in connection.execute(f"PRAGMA table_info('{table.name}')")}
     columns = [column for column in table.columns if column.name in known]
-    if not columns:  # an earlier revision lacks some tables
+    wrong = {column.name: f"typeof({column.name}) NOT IN {_STORED[_kind(column)]}" for column in columns}
+    for name, condition in _contents(columns).items():
+        wrong[name] += f" OR {condition}"
+    return _first_wrong(lambda query: connection.execute(query).fetchone(), table, wrong)
+
+
+def wrong_content(connection: sa.Connection, table: sa.Table) -> str:
+    """First value that does not belong into its column of a PostgreSQL store, in a clause; empty: there is none."""
+    return _first_wrong(lambda query: connection.execute(sa.text(query)).one_or_none(), table, _contents(table.columns))
+
+
+def _first_wrong(first: Callable[[str], Any], table: sa.Table, wrong: Mapping[str, str]) -> str:
+    """Clause on the first value for which a column's condition holds, found in one pass over the table."""
+    if not wrong:  # an earlier revision lacks some tables
         return ""
-    cases = "".join(f" WHEN typeof({c.name}) NOT IN {_STORED[_kind(c)]} THEN '{c.name}'" for c in columns)
-    types = "".join(f" WHEN '{c.name}' THEN typeof({c.name})" for c in columns)
-    found = connection.execute(
-        f"SELECT wrong, CASE wrong{types} END FROM (SELECT *, CASE{cases} END AS wrong FROM {table.name}) "
+    cases = "".join(f" WHEN {condition} THEN '{name}'" for name, condition in wrong.items())
+    keys = tuple(table.primary_key)
+    names = ", ".join(each.name for each in keys)
+    found = first(
+        f"SELECT wrong, {names} FROM (SELECT *, CASE{cases} END AS wrong FROM {table.name}) AS checked "
         "WHERE wrong IS NOT NULL LIMIT 1"
-    ).fetchone()
+    )
     if found is None:
         return ""
-    name, held = found
-    return wrong_type(f"{table.name}.{name}", _SQLITE_NAMES[held], _NAMES[_kind(table.columns[name])])
+    name, *key = found
+    column = table.columns[name]
+    value = first(f"SELECT {name} FROM {table.name} WHERE {wrong[name]} LIMIT 1")[0]
+    return f"{_clause(f'{table.name}.{name}', _kind(column), _content(column), value)}, in {row_name(keys, key)}"
+
+
+def row_name(columns: Iterable[sa.Column[Any]], key: Iterable[Any]) -> str:
+    """Name of a row by the columns of its key."""
+    parts = (f"{column.name} {_shown(held)}" for column, held in zip(columns, key, strict=True))
+    return f"the row of {', '.join(parts)}"
+
+
+def _shown(value: Any) -> str:
+    return "of bytes" if isinstance(value, bytes) else repr(value)[:80]
+
+
+def _contents(columns: Iterable[sa.Column[Any]]) -> dict[str, str]:
+    """Conditions for wrong contents by the names of those columns that have any."""
+    return {each.name: content.sql(each.name) for each in columns if (content := _content(each)) is not None}
+
+
+def _content(column: sa.Column[Any]) -> Content | None:
+    return column.type.content if isinstance(column.type, StoredValue) else None
 
 
 def _kind(column: sa.Column[Any]) -> type:
     return column.type.kind if isinstance(column.type, StoredValue) else column.type.python_type
 
 
-def check_values(metadata: sa.MetaData) -> None:
-    """Have all columns of some tables check their values."""
+def check_values(metadata: sa.MetaData, contents: Mapping[str, Content]) -> None:
+    """Have all columns of some tables check their values; `contents`: of columns by name. Whole numbers are counts."""
     for table in metadata.tables.values():
         for column in table.columns:
-            column.type = StoredValue(column.type, f"{table.name}.{column.name}")
+            default = _COUNT if column.type.python_type is int else None
+            content = contents.get(f"{table.name}.{column.name}", contents.get(column.name, default))
+            column.type = StoredValue(column.type, f"{table.name}.{column.name}", content)
 
 
-def wrong_type(column: str, held: str, wanted: str) -> str:
-    """Clause on a column, TABLE.COLUMN, with a value of another type."""
+def _clause(column: str, kind: type, content: Content | None, value: Any) -> str:
+    """Clause on a value that does not belong into its column, TABLE.COLUMN."""
+    if content is not None and (type(value) is kind or (type(value) is int and kind is float)):
+        return f"column {column} holds {_shown(value)} where {content.words} belongs"
+    held, wanted = _NAMES.get(type(value), f"a value of type {type(value).__name__}"), _NAMES[kind]
     return f"column {column} holds {held} where {wanted} belong{'' if wanted == _BYTES else 's'}"

@@ -176,6 +176,9 @@ class StoreWatch:
                 self.fault = f"the disk does not give it: {error}"
                 return
             report = await self._executor.run(partial(check_all, self._store, seconds, ended.is_set), slow=True)
+            if report.faults and report.faults[0] != self.fault:  # who reads finds a column, and this its row too
+                self.fault, self._why = report.faults[0], "; ".join(report.faults)
+                log.error("damage of the store", extra={"why": self._why})
             if report.complete and not report.faults:
                 await self._executor.run(self._resume)
         finally:
@@ -221,7 +224,7 @@ class StoreWatch:
             if self.lost != told:
                 told = self.lost
                 announce("the store has lost messages", told)
-            if self.fault != damage:
+            if bool(self.fault) != bool(damage):
                 damage = self.fault
                 if damage:
                     announce("store damaged", f"it is not written any more: {damage}")

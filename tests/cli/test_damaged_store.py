@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 from service_system import twin_file
-from store_cases import window
+from store_cases import outcome, window
 from typer.testing import CliRunner
 
 from servotwin.cli.app import INVALID, app
 from servotwin.store import engine
 from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import EvidenceRecord
 from servotwin.store.store import open_store
 
 COMMANDS = ["twin check", "servos", "audit ax-1", "replay ax-1", "backup b.db"]
@@ -181,7 +182,71 @@ def test_a_value_of_another_type_is_said_as_damage(
         writer.commit()
     result = CliRunner().invoke(app, [*command.split(), "--config", str(config)])
     assert result.exit_code == INVALID
-    assert re.fullmatch(rf"error: store .*: is damaged \((.*is damaged \()?{why}\)+.*\n", result.stderr)
+    assert re.fullmatch(rf"error: store .*: is damaged \((.*is damaged \()?{why}(, in .*)?\)+.*\n", result.stderr)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "why"),
+    [
+        ("twins.last_message", "9e300", "9e+300 where a time, in s since the epoch, before the year 10000"),
+        ("messages.received", "-1", "-1.0 where a time, in s since the epoch, before the year 10000"),
+        ("twins.serial", "9223372036854775807", "9223372036854775807 where a count up to 2**53"),
+        ("messages.sequence", "-1", "-1 where a count up to 2**53"),
+        ("messages.kind", "'{'", "'{' where one of window, letter, act, verification"),
+    ],
+)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_value_that_cannot_be_is_said_as_damage_with_its_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, column: str, value: str, why: str
+) -> None:
+    """A time far ahead ended `servos` and `audit` with a traceback."""
+    monkeypatch.chdir(tmp_path)
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    store = open_store(str(file))
+    store.put([window("ax-1", n) for n in range(4)])
+    store.close()
+    table, name = column.split(".")
+    with closing(sqlite3.connect(file)) as writer:
+        writer.execute(f"UPDATE {table} SET {name} = {value} WHERE rowid = 1")
+        writer.commit()
+    result = CliRunner().invoke(app, [*command.split(), "--config", str(config)])
+    row = "servo 'ax-1'" if table == "twins" else "id 1"
+    assert result.exit_code == INVALID
+    assert f"is damaged (column {column} holds {why} belongs, in the row of {row}); " in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("states SET state = x'83'", "column states.state holds what is no MessagePack, in the row of servo 'ax-1'"),
+        (
+            "outgoing SET body = x'c1'",
+            "column outgoing.body holds what is no MessagePack, in the row of servo 'ax-1', serial 1",
+        ),
+        ("evidence SET body = x''", "column evidence.body holds what is no MessagePack, in the row of id 1"),
+        ("contexts SET text = '{'", "column contexts.text holds what is no JSON, in the row of key 'c'"),
+    ],
+)
+def test_a_content_that_is_cut_short_is_said_by_the_check(tmp_path: Path, change: str, why: str) -> None:
+    """Nothing told that, and a state that cannot be read costs its servo what the twin had learnt."""
+    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+    with closing(open_store(str(file))) as store:
+        store.put([window("ax-1", 0)])
+        (lease,) = store.lease("me", 1, 30.0, 200.0)
+        record = EvidenceRecord("estimate", lease.messages[0].id, b"\x80", context="c")
+        made = outcome(lease, record, state=b"\x80", outgoing=(b"\x80",), contexts=(("c", "{}"),))
+        store.commit([made], 201.0)
+        store.fleet("a name")
+    arguments = ["twin", "check", "--config", str(config)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    with closing(sqlite3.connect(file)) as writer:
+        writer.execute(f"UPDATE {change}" + (" WHERE key = 'c'" if change.startswith("contexts") else ""))
+        writer.commit()
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == INVALID
+    assert f"is damaged ({why}); " in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_output_that_is_no_terminal_has_no_empty_line_for_the_progress(tmp_path: Path) -> None:

@@ -186,6 +186,21 @@ def test_a_table_that_is_gone_is_damage(filled: Store) -> None:
 
 
 @pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("twins SET last_message = 'NaN'", "column twins.last_message holds nan where a time, "),
+        ("messages SET sequence = -1", "column messages.sequence holds -1 where a count up to 2**53 belongs"),
+        ("messages SET kind = '{'", "column messages.kind holds '{' where one of window, letter, act, verification "),
+    ],
+)
+def test_a_value_that_cannot_be_is_damage_with_its_row(filled: Store, change: str, why: str) -> None:
+    run(filled, f"UPDATE {change}")
+    (fault,) = check_pages(filled, math.inf).faults
+    assert fault.startswith(why)
+    assert ", in the row of " in fault
+
+
+@pytest.mark.parametrize(
     ("column", "kind", "made"),
     [("messages.received", "text", "double precision"), ("messages.sequence", "text", "bigint")],
 )

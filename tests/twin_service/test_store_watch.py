@@ -12,6 +12,7 @@ from store_cases import postgresql_addresses
 from watched_store import posted, send, serve, until
 
 from servotwin.messages import Resend, decode, encode
+from servotwin.store.engine import StoreDamaged
 from servotwin.store.integrity import IntegrityReport
 from servotwin.store.store import open_store
 from servotwin.twin_service import store_watch
@@ -160,6 +161,32 @@ def test_a_value_of_another_type_that_is_read_is_damage_until_it_is_gone(tmp_pat
         change(system, "UPDATE twins SET gap = NULL")
         await until(lambda: not system.watch.fault)
         assert await send(client, 1) == [201]
+
+    serve(twin_file(tmp_path), body)
+
+
+@pytest.mark.parametrize(
+    ("change_", "clause"),
+    [
+        ("twins SET serial = 9223372036854775807", "twins.serial holds 9223372036854775807 where a count up to 2**53"),
+        ("messages SET kind = '{'", "messages.kind holds '{' where one of window, letter, act, verification"),
+    ],
+)
+def test_damage_that_a_reader_finds_is_told_with_its_row(tmp_path, monkeypatch, change_, clause):
+    """A kind that there is not ended the dispatcher, and with it all work."""
+    monkeypatch.setattr(store_watch, "_TELL_S", 0.01)
+    monkeypatch.setattr(store_watch, "_RECHECK_S", 0.01)
+
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        change(system, f"UPDATE {change_}")
+        with pytest.raises(StoreDamaged, match="is damaged"):
+            await system.executor.run(lambda: system.store.lease("me", 1, 30.0, 1e10))
+        await until(lambda: "in the row of" in system.watch.fault)
+        damage = (await client.get("/healthz")).json()["damage"]
+        row = "servo 'ax-1'" if "twins" in change_ else "id 1"
+        assert damage == f"column {clause} belongs, in the row of {row}"
+        assert system.dispatching
 
     serve(twin_file(tmp_path), body)
 
