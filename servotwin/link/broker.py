@@ -196,17 +196,27 @@ class Connection:
         self._client.disconnect()
         timer = threading.Timer(_LINGER_S, _shut, (connection,))  # loop_stop waits for the socket, without a limit
         timer.start()
-        self._client.loop_stop()
+        # While it connects there is no socket yet, and the client waits for that alone; its thread ends by itself then.
+        stopping = threading.Thread(target=self._client.loop_stop, name="MQTT stops", daemon=True)
+        stopping.start()
+        stopping.join(_LINGER_S if connection is None else None)
         timer.cancel()
         timer.join()
 
     def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, answer: Any) -> None:
         self._answered = True
+        if self._closing:
+            client.disconnect()
+            return
         if reason.is_failure:
             self._events.lost(f"the broker refuses the connection ({reason})")
             return
         self._number, self._up = self._number + 1, True
-        self._largest = getattr(answer, "MaximumPacketSize", 0)
+        before, self._largest = self._largest, getattr(answer, "MaximumPacketSize", 0)
+        if self._largest > 0 and (self._largest < before or not before):
+            # Each message that is too large now would end the connection, first of all of each one that follows; both
+            # ends repeat by themselves what has no answer.
+            client.drop_out_messages()
         self._fresh = not flags.session_present
         client.subscribe([(topic, _at_least_once()) for topic in self._session.topics])
 
@@ -229,6 +239,8 @@ class Connection:
         self._up = self._answered = False
 
     def _failed(self, _client: Client, _user: Any) -> None:
+        if self._closing:
+            return
         # Here, as ssl in `url`: the edge's control process, which knows brokers from its file only, does without it.
         from servotwin.link.connection_errors import cause_of, is_of_certificate
 

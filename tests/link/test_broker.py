@@ -2,6 +2,7 @@
 
 import queue
 import socket
+import threading
 from typing import Any
 
 import pytest
@@ -79,3 +80,26 @@ def test_a_broker_that_misses_the_pings_itself_is_not_said_to_hang() -> None:
                 assert said.get(timeout=PATIENCE) == "the connection to the broker broke (Keep alive timeout)"
         finally:
             connection.close()
+
+
+def test_a_connection_that_is_being_made_does_not_hold_up_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As to an address that swallows packets: a stop waited for the client's own time limit, 5 s."""
+    began, gone = threading.Event(), threading.Event()
+
+    def connect(*_arguments: object, **_more: object) -> socket.socket:
+        began.set()
+        gone.wait(PATIENCE)
+        raise OSError("no route")
+
+    monkeypatch.setattr(socket, "create_connection", connect)
+    said: queue.Queue[str] = queue.Queue()
+    quiet = MqttCallbacks(lambda *_: None, lambda _: None, said.put)
+    connection = Connection(Broker("mqtt://192.0.2.1"), MqttSession("edge", ("t",), 60), quiet)
+    client = connection._client._thread
+    assert began.wait(PATIENCE)
+    connection.close()
+    assert client is not None
+    assert client.is_alive()  # it was not waited for
+    gone.set()
+    client.join(PATIENCE)
+    assert said.empty()

@@ -54,3 +54,21 @@ def test_a_broker_that_ends_the_connection_at_a_message_is_said_to_do_so(tmp_pat
 def test_a_silent_twin_is_not_said_to_be_a_lost_connection(server: Mosquitto) -> None:
     with edge(Broker(server.url), timeout_s=0.5) as here:
         assert "connection" not in delivered_or_why(here, parcel(0))
+
+
+def test_a_message_that_is_too_large_for_the_limit_of_a_broker_that_came_back_holds_up_no_other(
+    tmp_path: Path, store: Store
+) -> None:
+    """The client sent it again, first of all, with each connection, until the edge was started anew."""
+    with (
+        broker(tmp_path / "broker") as server,
+        twin(Broker(server.url), store),
+        edge(Broker(server.url), timeout_s=3.0) as here,
+    ):
+        here.deliver(parcel(0))
+        server.kill()
+        here._connection.publish("servotwin/axis-1/up", bytes(30_000), 60.0)
+        settings = server.folder / "mosquitto.conf"
+        settings.write_text(settings.read_text() + "max_packet_size 20000\n")
+        server.start()
+        assert [delivered_or_why(here, HELLO) for _ in range(5)][-1] == ""
