@@ -66,7 +66,10 @@ def tune(
     crossover: Annotated[float, typer.Argument(help="Gain crossover, rad/s.")],
     phase_margin_deg: Annotated[float, typer.Argument(help="Phase margin at the crossover, deg.")],
     servo: Annotated[str, typer.Option(help="A preset's name, or the TOML of a servo or an axis.")] = "paper",
-    kind: Annotated[str, typer.Option("--type", help="P, PI, PD, PDF, PID or PIDF.")] = "PIDF",
+    kind: Annotated[
+        str,
+        typer.Option("--type", help="P, PI, PD, PDF, PID or PIDF; cascade: of an axis, with an encoder at the motor."),
+    ] = "PIDF",
     ms_max: Annotated[float, typer.Option(help="Largest sensitivity peak that is accepted.")] = float("inf"),
     prefer: Annotated[
         str, typer.Option(help="Ms: smallest Ms, then largest Ki; Ki: largest Ki within --ms-max.")

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from servotwin.analysis.tuning.cascade import tune_cascade
+from servotwin.analysis.tuning.cascade import tune_cascade, under_cascade
 from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.cascade import Cascade
@@ -32,6 +32,8 @@ from servotwin.runtime.files import atomic_output, check_file
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
+CASCADE = "cascade"
+"""Type of the law that is tuned, beside those of the filtered PID."""
 _CASCADE_GAINS = ("position_gain", "velocity_gain", "integral_time")
 
 
@@ -58,6 +60,8 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     if request.output is not None:
         check_file(request.output, (".toml",))
     servo = resolve_plant(request.servo, tuned=False)
+    if request.kind == CASCADE:
+        servo = _with_cascade(servo, request)
     if isinstance(servo, Axis) and isinstance(servo.controller, Cascade):
         print_cascade(servo, servo.controller, request, as_json)
         return
@@ -154,9 +158,20 @@ def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool)
     _print_written(console, request)
 
 
+def _with_cascade(servo: Plant, request: TuneOptions) -> Axis:
+    """The axis whose controller is a cascade, or becomes one."""
+    if not isinstance(servo, Axis):
+        raise InvalidInput(
+            f"--type {CASCADE}: {request.servo} is a servo, whose controller is a filtered PID; a cascade is that of "
+            "an axis"
+        )
+    return servo if isinstance(servo.controller, Cascade) else under_cascade(servo, request.crossover)
+
+
 def _check_cascade(request: TuneOptions) -> None:
     """Refuse options that only a filtered PID has."""
-    plain = {"--type": (request.kind, "PIDF"), "--prefer": (request.prefer, "Ms"), "--b": (request.b, 1.0)}
+    kind = "PIDF" if request.kind == CASCADE else request.kind
+    plain = {"--type": (kind, "PIDF"), "--prefer": (request.prefer, "Ms"), "--b": (request.b, 1.0)}
     for option, (given, default) in {**plain, "--c": (request.c, None)}.items():
         if given != default:
             raise InvalidInput(f"{option} {given}: is for a filtered PID; leave it out for a cascade")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import servotwin as st
-from servotwin.analysis.tuning.cascade import tune_cascade
+from servotwin.analysis.tuning.cascade import tune_cascade, under_cascade
 from servotwin.cli.tune import TuneOptions, print_tuning
 from servotwin.plant.linear import Complex
 from servotwin.plant.signals import Array
@@ -194,3 +194,45 @@ def test_the_command_refuses_a_linear_law_by_the_key_of_its_file(tmp_path: Path)
     with pytest.raises(st.InvalidInput, match=r'axis\.toml: controller\.kind = "linear": tune finds') as error:
         print_tuning(options, as_json=True)
     assert "<" not in str(error.value)
+
+
+PID = SCREW.replace(controller=st.Controller(1.0, 0.0, 0.0, 1.0, sample_rate=4000.0, voltage_limit=3.0))
+
+
+def test_an_axis_under_a_filtered_pid_gets_a_cascade_with_its_rate_and_limits() -> None:
+    """A filter of the speed that is ten times as fast as the velocity loop leaves it the margin that is asked for."""
+    axis = under_cascade(PID, 300.0)
+    law = tune_cascade(axis, 300.0, math.radians(60.0)).controller
+    assert (law.sample_rate, law.voltage_limit, law.ratio, law.speed_filter) == (4000.0, 3.0, SCREW.p, 0.1 / 300.0)
+    s, loop = 300j, complex(SCREW.plants()[0].response(np.array([300.0]))[0])
+    assert law.velocity_gain is not None
+    assert law.integral_time is not None
+    loop *= law.velocity_gain * (1.0 + 1.0 / (law.integral_time * s)) * s / (law.speed_filter * s + 1.0)
+    assert abs(loop) == pytest.approx(1.0, rel=1e-9)
+    assert math.pi + math.atan2(loop.imag, loop.real) == pytest.approx(math.radians(60.0), rel=1e-9)
+
+
+def test_a_cascade_on_the_motor_needs_its_encoder() -> None:
+    with pytest.raises(st.InvalidInput, match="the controller reads y_motor, the motor's encoder"):
+        under_cascade(PID.replace(sensors=st.Sensors(motor_encoder=False)), 300.0)
+
+
+def test_the_command_makes_it_a_cascade(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, tuned = tmp_path / "axis.toml", tmp_path / "tuned.toml"
+    path.write_text(PID.dumps())
+    print_tuning(TuneOptions(str(path), "cascade", 300.0, 60.0, math.inf, "Ms", 0.0, 1.0, None, tuned), as_json=False)
+    assert "velocity_gain_n_m_s_per_rad" in capsys.readouterr().out
+    law = st.Axis.from_file(tuned).controller
+    expected = tune_cascade(under_cascade(PID, 300.0), 300.0, math.radians(60.0)).controller
+    assert law.replace(release_time=None) == expected.replace(release_time=None)
+    again = TuneOptions(str(tuned), "cascade", 200.0, 60.0, math.inf, "Ms", 0.0, 1.0, None)
+    print_tuning(again, as_json=True)
+    assert json.loads(capsys.readouterr().out)["gains"].keys() == {
+        "position_gain_per_s", "velocity_gain_n_m_s_per_rad", "integral_time_s",
+    }  # fmt: skip
+
+
+def test_the_paper_s_servo_has_no_cascade() -> None:
+    options = TuneOptions("paper", "cascade", 4.0, 60.0, math.inf, "Ms", 0.0, 1.0, None)
+    with pytest.raises(st.InvalidInput, match=r"--type cascade: paper is a servo, .* that of an axis"):
+        print_tuning(options, as_json=False)

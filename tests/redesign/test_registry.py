@@ -13,6 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified import fallback
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
@@ -126,12 +127,12 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
+def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(fallback, "ways_out", lambda *_: "another way out")
     reason = r"no fallback set for the servo's stated range: none of \d+ candidates "
     ranges = "steps of 0.1 to 2.5 mm from rest, gaps of 0 to 60 deg, input bias of -0.1 to 0.1 V, friction of 0 to 0"
-    words = rf"{reason}.* by default are {ranges} N m; if gaps or steps of this machine "
-    words += r"are smaller, state them \(gap_deg and step_mm\); without a twin it can be simulated: "
-    words += r"enabled = false in \[twin\], and no policy$"
+    words = rf"{reason}.* by default are {ranges} N m; another way out; "
+    words += r"without a twin it can be simulated: enabled = false in \[twin\], and no policy$"
     with pytest.raises(InvalidInput, match=words):
         load(tmp_path, "[twin.demands]\nsettled_percent = 100\nvelocity_feedforward = false\nMs = 1.2")
 

@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from servotwin.control.cascade import Cascade
 from servotwin.control.linear_law import LOAD
 from servotwin.errors import InvalidInput
+from servotwin.plant.actuator import VelocityDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.margins import Margins
 
 # Crossover of the velocity loop over that of the position loop, where none is given: the usual four to ten.
 _APART = 5.0
+# Time constant of the filter of the speed times the crossover of the velocity loop, where a cascade is made.
+_FILTER = 0.1
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,36 @@ def tune_cascade(
     outer = crossover / _APART if position_crossover is None else position_crossover
     _check(crossover, outer, phase_margin, delay)
     return _position_loop(axis, _velocity_loop(axis, own, crossover, phase_margin, integral, delay), outer, delay)
+
+
+def under_cascade(axis: Axis, crossover: float) -> Axis:
+    """The axis with a cascade, still without gains, in place of its filtered PID: with the same rate and limits.
+
+    Parameters
+    ----------
+    axis : Axis
+        With an encoder at the motor.
+    crossover : float
+        rad/s, of the velocity loop; the filter of the speed is ten times as fast.
+
+    Raises
+    ------
+    InvalidInput
+        The controller is a linear law, the motor has no encoder, or the crossover is not positive and finite.
+    """
+    own = axis.pidf
+    _check(crossover, crossover, math.pi / 2.0, 0.0)
+    closed = isinstance(axis.actuator, VelocityDrive)
+    cascade = Cascade(
+        position_gain=0.0,
+        ratio=axis.p,
+        velocity_gain=None if closed else 1.0,
+        speed_filter=_FILTER / crossover,
+        voltage_limit=own.voltage_limit,
+        rate_limit=own.rate_limit,
+        sample_rate=own.sample_rate,
+    )
+    return axis.replace(controller=cascade)
 
 
 def _position_loop(axis: Axis, law: Cascade, crossover: float, delay: float) -> CascadeTuning:

@@ -23,13 +23,13 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty, in_words
+from servotwin.redesign.certified.ways_out import ways_out
 from servotwin.redesign.design import decoded_part
 from servotwin.runtime.files import atomic_output
 from servotwin.runtime.user_cache import cache_folder, source_digest
@@ -74,11 +74,8 @@ def fallback_certificate(servo: Plant, uncertainty: Uncertainty, demands: Demand
         result = certify(servo, uncertainty, demands, trial)
         if isinstance(result, NotVerified):
             known = f"stated in [twin.uncertainty] or by default are {in_words(uncertainty, servo)}"
-            keys = f"gap_deg and step_{position_unit(servo).name}"
-            raise InvalidInput(
-                f"no fallback set for the servo's stated range: {result.reason}; {known}; if gaps or steps of this "
-                f"machine are smaller, state them ({keys})"
-            )
+            verified = ways_out(servo, uncertainty, demands, trial)
+            raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}; {known}; {verified}")
         return result
 
     values = {"servo": servo, "uncertainty": uncertainty, "demands": demands, "trial": replace(trial, threads=None)}
