@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from servotwin.control.controller import Controller
+from servotwin.estimation import output_error
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine
 from servotwin.estimation.learning.wear import Wear
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
@@ -26,6 +28,12 @@ MODEL = Axis(
     Transmission(p=1.0, k_d=3300.0, c_d=20.0, in_gap="free"),
     Load((5.6,), (0.0,), (0.3,), "rotary"),
     Controller(Kp=60.0, Ki=20.0, Kd=40.0, Tf=0.01),
+)
+GEARED = Axis(
+    TorqueDrive(J=0.0123, friction=3.6e-4),
+    Transmission(0.02, 8.2, 3.3, "free"),
+    Load((90.6,), (0.0,), (2.84,), "rotary"),
+    Controller(Kp=4.21e-3, Ki=0.0, Kd=0.1715, Tf=1.7),
 )
 GAP, NOISE = 0.03, 2e-5
 SETTINGS = TwinSettings(policy="paper", k_dz=0.0)
@@ -123,6 +131,19 @@ def test_another_machine_under_the_same_name_is_refused_and_learnt_when_three_wi
     assert abs(machines[-1].factors[K] - math.log(0.85)) < 2.5 * spreads(machines[-1])[K]
     last = others[-1][0]
     assert last.interval[0] < GAP < last.interval[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("inertia", "step"), [(1.6, 0.0148), (2.0, 0.011)])
+def test_a_payload_that_has_changed_gives_no_bound_above_the_gap(inertia: float, step: float) -> None:
+    """Within what was learnt one flank explains the window best, and bounds were 1.9 to 3.6 times the gap."""
+    gap, machine = 0.0965, FactorPrior(np.zeros(4), np.diag(np.square([0.01, 0.05, 0.005, 0.05])))
+    loaded = GEARED.scaled({"m": inertia})
+    run = simulate(loaded, 1100.0, reference=SquareWave(step, 850.0), gap=gap, sample_rate=7.36)
+    settings, window = output_error.OutputErrorSettings(), Window.from_run(run, 850.0, 204.0)
+    made = output_error.estimate(window, GEARED, None, settings, machine)
+    assert not made.ok
+    assert made.interval[0] <= gap
 
 
 def test_a_free_shaft_learns_nothing_where_learning_is_off() -> None:

@@ -23,18 +23,24 @@ from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.flank import OneFlank
 from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
-from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
+from servotwin.estimation.output_error.learnt_shaft import (
+    ShaftReading,
+    adapted_shaft,
+    beside_what_was_learnt,
+    is_learnt,
+    shaft_reading,
+)
 from servotwin.estimation.output_error.models import FRICTION_PARTS, MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.one_way import moves_one_way
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.sampling import too_slow
-from servotwin.estimation.output_error.search import also_from, search
+from servotwin.estimation.output_error.search import search
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.unexplained import slow_error
-from servotwin.estimation.output_error.verdict import JudgedFit, judge
+from servotwin.estimation.output_error.verdict import JudgedFit, bounded_by_both, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.channels import corrected, faults, other_units, refused
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -54,7 +60,6 @@ _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channel
 _SAMPLES_LATE = 3.0
 _GAPS = np.linspace(0.0, 0.3, 16)  # of the motor's travel; with wider ones a gap looks like another ratio
 _COASTS = 0.1  # of the position's motion: what play leaves of a load that coasts in the gap, and no wrong ratio does
-_MUCH_LESS = 0.5  # of the errors with what was learnt: another shaft that leaves no more than this is the machine's
 _UNSURE = 3.0  # standard deviations of the motor's angle by which it may be beside what its encoder shows
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
@@ -143,12 +148,15 @@ def fitted(
         words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
         return FittedWindow(replace(blank, reasons=(words,)))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)
-    found, other = _beside_what_was_learnt(found, window, theta_m, axis, settings, machine)
+    freed = _freed(found, window, theta_m, axis, settings, machine)
+    found, other = beside_what_was_learnt(found, freed)
     unit, possible = 2.0 / lever(axis), possible_half(found)
     verdict = judge(found, settings, unit, possible, axis.p * noise)
+    if freed is not None and verdict.status is GapStatus.LOWER_BOUND:
+        verdict = bounded_by_both(verdict, judge(freed, settings, unit, None, axis.p * noise))
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
-    if verdict.status is GapStatus.OK and other:
+    if verdict.status is not GapStatus.MODEL_MISMATCH and other:
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=other)
     if verdict.status is GapStatus.OK and (alike := moves_one_way(axis, window.position)):
         verdict = JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(alike,))
@@ -176,27 +184,18 @@ def _with_machine(
     return replace(stated, machine=taught(machine, found, possible, settings.calibration))
 
 
-def _beside_what_was_learnt(
+def _freed(
     found: Search,
     window: Window,
     theta_m: Array,
     axis: Axis,
     settings: OutputErrorSettings,
     machine: FactorPrior | None,
-) -> tuple[Search, tuple[str, ...]]:
-    """The fit, begun again where another shaft than the learnt one fits, and the sentence if that leaves far less.
-
-    The search ends a few per cent from what was learnt. There a shaft of another machine fits best in a wrong gap, and
-    leaves slow motion; and so close the search may miss the right minimum of the learnt one.
-    """
+) -> Search | None:
+    """The fit with the usual freedom, where the one near what was learnt leaves slow motion; otherwise None."""
     if machine is None or slow_error(found) == 0.0 or not is_learnt(machine, settings):
-        return found, ()
-    other = _fit(window, theta_m, axis, None, settings, None)[0].best
-    found = also_from(found, other.values)
-    less = float(np.linalg.norm(other.raw) / np.linalg.norm(found.best.raw))
-    if less > _MUCH_LESS:
-        return found, ()
-    return found, (f"another shaft than the one that was learnt leaves {100.0 * less:.2g} % of the errors only",)
+        return None
+    return _fit(window, theta_m, axis, None, settings, None)[0]
 
 
 def _broken(window: Window, axis: Axis) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
-from servotwin.estimation.output_error.unexplained import unexplained
+from servotwin.estimation.output_error.unexplained import slow_error, unexplained
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
@@ -144,10 +144,25 @@ def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
     """Decide on a window that shows one flank, for a reason in words."""
     count = found.problem.count
     hidden = _hidden_friction(found, single) + float(np.max(error_between_samples(found, _FEW)))
+    # What the fit leaves is in no noise, and may move the flank by as much.
+    hidden += NORMAL_95 * DOUBT * slow_error(found)
     bound = _BOUND * 2.0 * (smallest_half(found, single) - hidden) - count
     enough = bound > _BOUND_COUNTS * count
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
     return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
+
+
+def bounded_by_both(learnt: JudgedFit, freed: JudgedFit) -> JudgedFit:
+    """Decide on a lower bound within what was learnt of the machine, beside the fit with the usual freedom.
+
+    A machine that has changed is one of which nothing was learnt: gaps that only the earlier one excludes are not.
+    """
+    if freed.status is GapStatus.LOWER_BOUND:
+        return min(learnt, freed, key=lambda each: each.half)
+    if freed.status is not GapStatus.OK:
+        return freed
+    words = "one flank explains the window within what was learnt of the machine, and two with the usual freedom"
+    return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(words,))
 
 
 def _out_of_reach(found: Search, half: float) -> bool:
