@@ -17,7 +17,8 @@ from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
-from servotwin.plant.signals import SquareWave
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 from servotwin.twin.estimating import estimator_of, known_machine, stated_machine
@@ -34,6 +35,13 @@ GEARED = Axis(
     Transmission(0.02, 8.2, 3.3, "free"),
     Load((90.6,), (0.0,), (2.84,), "rotary"),
     Controller(Kp=4.21e-3, Ki=0.0, Kd=0.1715, Tf=1.7),
+)
+ROBOT = Axis(
+    TorqueDrive(J=40.2, friction=23.3),
+    Transmission(0.02, 2.905e6, 4.56e4, "free"),
+    Load((8.637e4,), (0.0,), (5.676e4,), "rotary"),
+    Controller(Kp=2504.6, Ki=0.0, Kd=5190.5, Tf=0.08635, sample_rate=145.0),
+    Sensors(2.0 * math.pi / 65536, 2.0 * math.pi / 2**24),
 )
 GAP, NOISE = 0.03, 2e-5
 SETTINGS = TwinSettings(policy="paper", k_dz=0.0)
@@ -64,6 +72,11 @@ def followed(windows: list[Window], wear: Wear) -> list[tuple[GapEstimate, Wear]
 def learnt() -> list[tuple[GapEstimate, Wear]]:
     """Three windows of a machine that is 4 % stiffer and a quarter less damped than its model."""
     return followed([seen(1.04, 0.75, number) for number in range(3)], Wear(0.0))
+
+
+def known_to(damping: float) -> FactorPrior:
+    """A stiffness that is known to 1 %, and the damping to a share."""
+    return FactorPrior(np.zeros(4), np.diag(np.square([0.01, damping, 0.005, 0.05])))
 
 
 def machine_of(wear: Wear) -> LearntMachine:
@@ -137,13 +150,24 @@ def test_another_machine_under_the_same_name_is_refused_and_learnt_when_three_wi
 @pytest.mark.parametrize(("inertia", "step"), [(1.6, 0.0148), (2.0, 0.011)])
 def test_a_payload_that_has_changed_gives_no_bound_above_the_gap(inertia: float, step: float) -> None:
     """Within what was learnt one flank explains the window best, and bounds were 1.9 to 3.6 times the gap."""
-    gap, machine = 0.0965, FactorPrior(np.zeros(4), np.diag(np.square([0.01, 0.05, 0.005, 0.05])))
+    gap, machine = 0.0965, known_to(0.05)
     loaded = GEARED.scaled({"m": inertia})
     run = simulate(loaded, 1100.0, reference=SquareWave(step, 850.0), gap=gap, sample_rate=7.36)
     settings, window = output_error.OutputErrorSettings(), Window.from_run(run, 850.0, 204.0)
     made = output_error.estimate(window, GEARED, None, settings, machine)
     assert not made.ok
     assert made.interval[0] <= gap
+
+
+@pytest.mark.slow
+def test_a_gap_that_grows_within_the_window_is_no_softer_shaft() -> None:
+    """It grows by 1.9 %, which moves the fit's gap by 10 % and its stiffness by more than is known of it."""
+    machine, settings = known_to(0.1), output_error.OutputErrorSettings(gap_rate=3.26e-4)
+    gap = SCurve(0.145, 0.22, 345.4, begin=-124.3)
+    run = simulate(ROBOT, 54.0, reference=SquareWave(0.0177174, 43.17), gap=gap, sample_rate=145.0)
+    made = output_error.estimate(Window.from_run(run, 43.172, 10.4), ROBOT, None, settings, machine)
+    assert made.ok, made.reasons
+    assert made.interval[0] <= float(np.interp(made.time, run.time, run.gap)) <= made.interval[1]
 
 
 def test_a_free_shaft_learns_nothing_where_learning_is_off() -> None:

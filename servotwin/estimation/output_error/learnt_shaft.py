@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.mismatches import moved_by_growth
 from servotwin.estimation.output_error.models import LEARNT, ShaftModel
 from servotwin.estimation.output_error.rounding import per_count
 from servotwin.estimation.output_error.search import also_from
@@ -105,7 +106,7 @@ class ShaftReading(NamedTuple):
         )
 
 
-def shaft_reading(found: Search, machine: FactorPrior, calibration: float) -> ShaftReading:
+def shaft_reading(found: Search, machine: FactorPrior, calibration: float, rate: float = 0.0) -> ShaftReading:
     """Join what a window tells of the machine to what was known.
 
     Parameters
@@ -115,12 +116,15 @@ def shaft_reading(found: Search, machine: FactorPrior, calibration: float) -> Sh
     machine : FactorPrior
     calibration : float
         Reported over computed standard deviation.
+    rate : float
+        Growth of the half gap at the load, 1/s, as likely as a standard deviation.
     """
     model = found.problem.model
     assert isinstance(model, ShaftModel)
     which, places = (np.array(each) for each in zip(*model.places, strict=True))
     known = machine.covariance[np.ix_(which, which)]
     unmodelled = np.hypot(_unmodelled(model.axis)[which], _by_slow_error(found, places))
+    unmodelled = np.hypot(unmodelled, moved_by_growth(found, rate, places.tolist()))
     told, score = _own_information(found, places, calibration, unmodelled)
     # In units of what was known the prior is white.
     lower = np.linalg.cholesky(known)

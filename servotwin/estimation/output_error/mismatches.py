@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Search, descend
 from servotwin.estimation.output_error.models import HALF
-from servotwin.estimation.output_error.rounding import influence, rounded
+from servotwin.estimation.output_error.rounding import influence, moved_by, rounded
 from servotwin.estimation.output_error.search import LEFT_COUNTS, rms
 from servotwin.estimation.output_error.unexplained import slow
 from servotwin.plant.signals import Array
@@ -22,6 +23,7 @@ _OUTLYING = 7.0  # standard deviations
 DOUBT = 2.0  # interval over the computed one
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
+_DIFFERENCE = 1e-6  # of the way between motor and load, that makes a derivative
 
 
 def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple[str, ...]:
@@ -40,16 +42,17 @@ def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple
         sentences.append(
             f"the model leaves motion of {100.0 * left / best.values[HALF]:.0f} % of half the gap unexplained"
         )
-    sentences += unusual_numbers(found, likely, shown=True)
+    sentences += unusual_numbers(found, likely, shown=True, rate=rate)
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
 
 
-def unusual_numbers(found: Search, likely: Array, shown: bool = False) -> tuple[str, ...]:
+def unusual_numbers(found: Search, likely: Array, shown: bool = False, rate: float = 0.0) -> tuple[str, ...]:
     """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them.
 
-    Rounding may have moved them: a motor that touches softly, within few counts of its encoder, looks soft and late.
+    Rounding may have moved them: a motor that touches softly, within few counts of its encoder, looks soft and late. So
+    may a gap that grows at a `rate` (1/s, of the half gap).
     With `shown` only those count, of them at whose limit the search ended, that the window shows to be off.
     """
     problem, sentences = found.problem, list[str]()
@@ -59,17 +62,23 @@ def unusual_numbers(found: Search, likely: Array, shown: bool = False) -> tuple[
         known = math.isfinite(unknown.std) and unknown.unit != "damping"
         far = known and (size > _UNUSUAL * unknown.std or size >= limits[i])
         at_limit = bool(size >= limits[i])
-        if far and not _rounding_explains(found, i, size, at_limit) and not (shown and at_limit and hidden(found, i)):
+        if (
+            far
+            and not _errors_explain(found, i, size, at_limit, rate)
+            and not (shown and at_limit and hidden(found, i))
+        ):
             late = unknown.unit == "time"
             change = f"{1e3 * likely[i]:+.3g} ms" if late else f"{100.0 * math.expm1(likely[i]):+.2g} %"
             sentences.append(f"the {unknown.name} would be off by {change}")
     return tuple(sentences)
 
 
-def _rounding_explains(found: Search, which: int, size: float, at_limit: bool) -> bool:
-    """Tell whether an unknown may be off by a size because of rounding: alone where the search ended at its limit."""
-    rounding, known = rounded(found, which), found.problem.model.unknowns[which].std
-    return size <= _UNUSUAL * (rounding if at_limit else math.hypot(rounding, known))
+def _errors_explain(found: Search, which: int, size: float, at_limit: bool, rate: float) -> bool:
+    """Tell whether an unknown may be off by a size because of rounding and of a growing gap: by these alone where the
+    search ended at its limit."""
+    (grown,), known = moved_by_growth(found, rate, [which]), found.problem.model.unknowns[which].std
+    errors = math.hypot(rounded(found, which), grown)
+    return size <= _UNUSUAL * (errors if at_limit else math.hypot(errors, known))
 
 
 def hidden(found: Search, which: int) -> bool:
@@ -124,3 +133,22 @@ def grown(found: Search, rate: float) -> float:
     """
     apart, spread = between_halves(found)
     return _EVENLY * min(rate * found.problem.duration, 2.0 * math.hypot(apart, DOUBT * spread))
+
+
+def moved_by_growth(found: Search, rate: float, places: Sequence[int]) -> Array:
+    """(f,) changes of unknowns at places (f,) by a gap that grows within the window, as likely as in `grown`.
+
+    It touches the flanks a little later each time, as a soft shaft does. Linearised: a contact shows the half gap of
+    its time.
+    """
+    if rate == 0.0:
+        return np.zeros(len(places))
+    problem, best = found.problem, found.best
+    apart, spread = between_halves(found)
+    growth = min(rate * problem.duration, 2.0 * math.hypot(apart, DOUBT * spread))
+    observer, step = problem.model.slowing[-1] * problem.model.speed, _DIFFERENCE * problem.range
+    wider = best.values.copy()
+    wider[HALF] += step
+    change = (problem.misfit(wider, observer) - best.raw) / step
+    change *= growth * np.linspace(-0.5, 0.5, change.size)
+    return np.array([moved_by(found, change, place) for place in places])

@@ -21,7 +21,7 @@ from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
-from servotwin.estimation.output_error.unexplained import slow_error, unexplained
+from servotwin.estimation.output_error.unexplained import unexplained
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
@@ -144,8 +144,6 @@ def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
     """Decide on a window that shows one flank, for a reason in words."""
     count = found.problem.count
     hidden = _hidden_friction(found, single) + float(np.max(error_between_samples(found, _FEW)))
-    # What the fit leaves is in no noise, and may move the flank by as much.
-    hidden += NORMAL_95 * DOUBT * slow_error(found)
     bound = _BOUND * 2.0 * (smallest_half(found, single) - hidden) - count
     enough = bound > _BOUND_COUNTS * count
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
