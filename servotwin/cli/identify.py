@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from servotwin.cli.gap_options import GapForm, stated_gap
+from servotwin.cli.log_controller import controller_remarks
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import is_motors_position
@@ -72,7 +73,8 @@ class Identification:
     estimates : tuple of GapEstimate
         One for each window.
     remarks : tuple of tuple of str
-        For each window, sentences on what it shows of the machine: a gap that has jumped or fallen, another machine.
+        For each window, sentences on what it shows of the machine: a gap that has jumped or fallen, another machine,
+        another controller.
     trend : Trend or None
         After the last window; None without an estimate that is OK.
     until_limit : Passage or None
@@ -111,6 +113,10 @@ def identify(options: IdentifyOptions, progress: Report = _silent) -> Identifica
     else:
         followed = _followed(windows, seen, settings, progress)
     trend = followed.trend
+    if seen is servo and not servo.at_motor:
+        added = controller_remarks(windows, servo.controller)
+        remarks = tuple(mine + more for mine, more in zip(followed.remarks, added, strict=True))
+        followed = followed._replace(remarks=remarks)
     until = None if settings.gap_limit is None or trend is None else trend.time_until(settings.gap_limit)
     return Identification(servo, windows, *followed, until)
 

@@ -37,7 +37,7 @@ tick = verbatim(law.tick)
 
 _BLOCKS = 250  # means of voltages that are compared: noise, delays and jitter of a few samples average out
 _FEWEST_BLOCKS = 100  # of two samples
-_TOLERATED = 0.1  # share of the voltage's swing: a discretisation or a rate that differs leaves less
+TOLERATED = 0.1  # share of the voltage's swing: a discretisation or a rate that differs leaves less
 _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, as volts, that are tolerated
 _NOISES = 2.0  # the same of noise as a linear law shows it in the means, from what it read and from what was recorded
 _HARDLY = 0.03  # share of the stated controller's swing: less is no voltage that turns the motor
@@ -156,7 +156,7 @@ def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float)
         voltage, rest = window.voltage[delay:], inputs[: len(inputs) - delay]
         swing = _swing(_means(voltage, 0))
         noise = rms(_means(noise_in_command(running, tolerance, rest, spreads), 0))
-        tolerated = _TOLERATED * swing + _ROUNDING * _rounding(voltage) + _NOISES * noise
+        tolerated = TOLERATED * swing + _ROUNDING * _rounding(voltage) + _NOISES * noise
         given = command_from_best_start(running, tolerance, voltage, rest)
         expected = _swing(_means(given, 0))
         if tolerated >= _LARGEST * max(swing, expected):
@@ -193,7 +193,7 @@ def _compared(
         return None
     swing, stiff = _swing(_means(voltage, first)), _stiffness(parameters)
     rounding = _rounding(voltage) + stiff * _rounding(position)
-    tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
+    tolerated = TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
     given = _voltage_from_best_start(parameters, voltage, reference, position)
     expected = _swing(_means(given, first))
     if tolerated >= _LARGEST * max(swing, expected):

@@ -64,6 +64,25 @@ def test_the_wear_of_an_axis_is_that_of_its_gap_and_log(logs: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("gains", [1.0, 0.6])
+def test_a_controller_that_was_changed_within_a_log_is_said(tmp_path: Path, gains: float) -> None:
+    """The same machine, from the fifth of eight windows on with other gains."""
+    stated = DRIVE.replace(controller=st.Controller(Kp=60.0, Ki=0.0, Kd=40.0, Tf=0.01, sample_rate=1000.0))
+    changed = stated.controller.replace(Kp=60.0 * gains, Kd=40.0 * gains)
+    runs = [
+        st.simulate(stated, 8.0, controller=law, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=1000.0)
+        for law in (stated.controller, changed)
+    ]
+    parts = {name: [run.columns[name][:-1] for run in runs] for name in runs[0].columns if name != "time_s"}
+    joined = {name: np.concatenate(values) for name, values in parts.items()}
+    table = {"time_s": np.arange(16000) / 1000.0, **joined}
+    write_log(SignalTable(table, {"servo": stated.dumps()}), tmp_path / "log.npz")
+    found = identify(IdentifyOptions(tmp_path / "log.npz", window=1.9, wear_deg=0.4, wear_over_s=16.0))
+    said = [i for i, remarks in enumerate(found.remarks) if any("another law" in remark for remark in remarks)]
+    assert said == ([] if gains == 1.0 else [4])
+
+
+@pytest.mark.slow
 def test_a_gap_that_grows_tenfold_within_a_log_is_followed(tmp_path: Path) -> None:
     """The trend's wear is what the accepted windows show, six times what the gap grows by itself: it does not lag."""
     gap = st.SCurve(0.01, 0.1, duration=8.0)

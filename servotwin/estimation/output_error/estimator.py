@@ -176,8 +176,7 @@ def _with_machine(
     if machine is None or not stated.ok:
         return stated
     if possible is None:
-        rate = 0.5 * lever(found.problem.model.axis) * settings.gap_rate
-        reading = shaft_reading(found, machine, settings.calibration, rate)
+        reading = shaft_reading(found, machine, settings.calibration, settings.gap_rate)
         return _with_shaft(stated, reading, is_learnt(machine, settings))
     # A spread that is small beside the motor's travel only is too large to tell a ratio.
     if stated.std > settings.largest_share * stated.gap:

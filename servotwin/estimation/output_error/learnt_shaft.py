@@ -106,7 +106,7 @@ class ShaftReading(NamedTuple):
         )
 
 
-def shaft_reading(found: Search, machine: FactorPrior, calibration: float, rate: float = 0.0) -> ShaftReading:
+def shaft_reading(found: Search, machine: FactorPrior, calibration: float, gap_rate: float = 0.0) -> ShaftReading:
     """Join what a window tells of the machine to what was known.
 
     Parameters
@@ -116,15 +116,16 @@ def shaft_reading(found: Search, machine: FactorPrior, calibration: float, rate:
     machine : FactorPrior
     calibration : float
         Reported over computed standard deviation.
-    rate : float
-        Growth of the half gap at the load, 1/s, as likely as a standard deviation.
+    gap_rate : float
+        Growth of the total gap at the motor, rad/s, as likely as a standard deviation.
     """
     model = found.problem.model
     assert isinstance(model, ShaftModel)
     which, places = (np.array(each) for each in zip(*model.places, strict=True))
     known = machine.covariance[np.ix_(which, which)]
     unmodelled = np.hypot(_unmodelled(model.axis)[which], _by_slow_error(found, places))
-    unmodelled = np.hypot(unmodelled, moved_by_growth(found, rate, places.tolist()))
+    grown = moved_by_growth(found, 0.5 * model.axis.p * gap_rate, places.tolist())
+    unmodelled = np.hypot(unmodelled, grown)
     told, score = _own_information(found, places, calibration, unmodelled)
     # In units of what was known the prior is white.
     lower = np.linalg.cholesky(known)
