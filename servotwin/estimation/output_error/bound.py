@@ -61,8 +61,13 @@ def _explains(found: Search, half: float, like: list[Fit], limit: float) -> bool
     The noise was learnt at the best fit, and speaks for it: below a share of a count it is no evidence. Where the best
     fit leaves slow motion, the model is not the machine's, and its other gaps may leave some times as much.
     """
-    least = max(math.hypot(rms(found.best.raw), _HARDLY * found.problem.count), _OTHER_MACHINE * slow_error(found))
+    least = max(math.hypot(rms(found.best.raw), _HARDLY * found.problem.count), _OTHER_MACHINE * _beyond_a_count(found))
     return any(fit.cost <= limit or rms(fit.raw) <= least for fit in _fits_at(found, half, like))
+
+
+def _beyond_a_count(found: Search) -> float:
+    """rms (m or rad at the load) of slow motion that the best fit leaves, without what a count may be."""
+    return math.sqrt(max(0.0, slow_error(found) ** 2 - found.problem.count**2))
 
 
 def _fits_at(found: Search, half: float, like: list[Fit]) -> Iterator[Fit]:
