@@ -126,5 +126,6 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
         "force_per_command": found.force_per_command,
         "doubts": list(drive.doubts),
         "late": drive.late or None,
+        "elastic": drive.elastic or None,
         "next_experiment": str(drive.advice),
     }

@@ -61,7 +61,7 @@ def recording_of(position, force, reference=None, count=1e-7, **more):
 
 
 @cache
-def elastic(stiffness=2e5, damping=60.0, gap=0.0, noise=1e-8, rate=2000.0):
+def elastic(stiffness=2e5, damping=60.0, gap=0.0, noise=1e-8, rate=2000.0, shake=1e-4):
     """A simulated loop of 8 kg at the motor and 12 kg on a shaft, shaken a little; positions of both ends."""
     p, random = 1e-3, np.random.default_rng(1)
     axis = st.Axis(
@@ -72,7 +72,7 @@ def elastic(stiffness=2e5, damping=60.0, gap=0.0, noise=1e-8, rate=2000.0):
         st.Sensors(feedback="motor"),
     )
     reference = strokes(cycles=2, rate=rate)
-    reference = reference + 1e-4 * np.convolve(random.standard_normal(reference.size), np.hanning(9), "same")
+    reference = reference + shake * np.convolve(random.standard_normal(reference.size), np.hanning(9), "same")
     time = np.arange(reference.size) / rate
     held = st.Samples(tuple(time), tuple(reference))
     run = st.simulate(axis, time[-1], reference=held, sample_rate=rate, gap=gap)
@@ -81,12 +81,19 @@ def elastic(stiffness=2e5, damping=60.0, gap=0.0, noise=1e-8, rate=2000.0):
 
 
 @cache
-def simulated(integral_time=None, count=1e-7, rate=RATE):
-    """A simulated loop of a cascade and a drive with friction, its position counted: recording with reference."""
+def simulated(integral_time=None, count=1e-7, rate=RATE, delay=0, lag=0.0):
+    """A simulated loop of a cascade and a drive with friction, its position counted: recording with reference.
+
+    The drive's force lags its command by a time constant (s); the encoder is late by whole samples, which is the same
+    to a log as a drive that is.
+    """
     p = 1e-3
     axis = st.Axis(
         st.TorqueDrive(
-            PARAMETERS["inertia"] * p * p, friction=PARAMETERS["viscous"] * p * p, coulomb=PARAMETERS["coulomb"] * p
+            PARAMETERS["inertia"] * p * p,
+            lag,
+            friction=PARAMETERS["viscous"] * p * p,
+            coulomb=PARAMETERS["coulomb"] * p,
         ),
         st.Transmission(p),
         st.Load((PARAMETERS["inertia"],)),
@@ -99,7 +106,7 @@ def simulated(integral_time=None, count=1e-7, rate=RATE):
             speed_filter=3e-3,
             sample_rate=rate,
         ),
-        st.Sensors(encoder_resolution=count / p, feedback="motor"),
+        st.Sensors(encoder_resolution=count / p, feedback="motor", encoder_delay=delay / rate),
     )
     reference = strokes(cycles=2, rate=rate)
     time = np.arange(reference.size) / rate
@@ -111,4 +118,5 @@ def simulated(integral_time=None, count=1e-7, rate=RATE):
         input_bias=-PARAMETERS["offset"] * p,
     )
     position = np.round(run.theta_m * p / count) * count
+    position = np.concatenate([np.full(delay, position[0]), position[: position.size - delay]])
     return recording_of(position, run.voltage / p, reference, count=count, rate=rate)

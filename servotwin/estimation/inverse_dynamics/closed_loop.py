@@ -14,8 +14,17 @@ import numpy as np
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.linear_law import MOTOR
+from servotwin.estimation.inverse_dynamics.command_delay import DELAY, derivative
 from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, low_passed, motion_of
-from servotwin.estimation.inverse_dynamics.fit import SYMMETRIC, ParameterFit, Rows, fit_models, regressors, rows_of
+from servotwin.estimation.inverse_dynamics.fit import (
+    ASYMMETRIC,
+    SYMMETRIC,
+    ParameterFit,
+    Rows,
+    fit_models,
+    regressors,
+    rows_of,
+)
 from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
@@ -28,8 +37,9 @@ from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 
 FittedLaw = FittedCascade | FittedPid
-_ROUNDS = 8
+_ROUNDS = 12
 _CONVERGED = 1e-3  # relative change of inertia and Coulomb friction, of the force
+_RESTS, _LEAST_LAG = 0.1, 0.01  # samples: change of the lag, least lag
 _TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
 
 
@@ -53,15 +63,16 @@ class SimulatedLog:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Fits to the simulated motion, and if they converged."""
+    """Fits to the simulated motion, if they converged, and the lag of the drive's force behind its command, s."""
 
     symmetric: ParameterFit
     asymmetric: ParameterFit
     simulated: SimulatedLog
     converged: bool
+    lag: float = 0.0
 
 
-def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: float) -> Axis:
+def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: float, lag: float = 0.0) -> Axis:
     """The axis that a fit describes: a torque drive on a rigid transmission, p travel per radian of the motor.
 
     Raises
@@ -71,7 +82,9 @@ def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: 
     """
     inertia = fit["inertia"]
     return Axis(
-        TorqueDrive(inertia * p * p, friction=max(fit["viscous"], 0.0) * p * p, coulomb=max(fit["coulomb"], 0.0) * p),
+        TorqueDrive(
+            inertia * p * p, lag, friction=max(fit["viscous"], 0.0) * p * p, coulomb=max(fit["coulomb"], 0.0) * p
+        ),
         Transmission(p),
         # Rigid with the motor, whose inertia contains it.
         Load((inertia,), motion=ROTARY if recording.rotary else LINEAR),
@@ -120,25 +133,35 @@ def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: Re
 
 
 def refine(
-    first: ParameterFit, law: FittedLaw, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
+    first: ParameterFit,
+    law: FittedLaw,
+    recording: DriveRecording,
+    band: RegressionBand,
+    cycle: float,
+    p: float,
+    lag: float,
 ) -> Refinement | None:
     """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track, or
     the fit leaves what an axis can be.
     """
     fit, found = first, None
     for _ in range(_ROUNDS):
-        simulated = simulated_log(rigid_axis(fit, law, recording, p), fit["offset"], recording, band)
+        simulated = simulated_log(rigid_axis(fit, law, recording, p, lag), fit["offset"], recording, band)
         if not simulated.position_error < _TRACKS:
             return None
         motion = motion_of(simulated.position, recording.rate, band)
-        symmetric, asymmetric = fit_models(_rows(recording, motion, band, cycle, fit, simulated))
+        both = fit_models(_rows(recording, motion, band, cycle, fit, simulated), DELAY)
+        symmetric, asymmetric = both[0].only(SYMMETRIC), both[1].only(ASYMMETRIC)
         change = np.abs(symmetric.values - fit.values)
         converged = bool(np.all(change < _CONVERGED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
-        found, fit = Refinement(symmetric, asymmetric, simulated, converged), symmetric
+        slower = both[0]["delay"] if lag > 0.0 else 0.0  # else the command's derivative stands for what is left
+        converged = converged and abs(slower) <= _RESTS / recording.rate
+        found, fit = Refinement(symmetric, asymmetric, simulated, converged, lag), symmetric
         if not symmetric["inertia"] > 0.0:  # it runs away, towards an axis that cannot be
             return None
         if converged:
             break
+        lag = max(lag + slower, _LEAST_LAG / recording.rate) if lag > 0.0 else 0.0
     return found
 
 
@@ -155,7 +178,8 @@ def _rows(
     What derivatives and the hold of a sampled command do to the simulation they do to the log, and cancel.
     """
     modelled = regressors(motion)[:, : len(SYMMETRIC)] @ fit.values
-    return rows_of(replace(recording, force=modelled + recording.force - simulated.force), motion, band, cycle)
+    force = modelled + recording.force - simulated.force
+    return rows_of(replace(recording, force=force), motion, band, cycle, derivative(recording, simulated.force))
 
 
 def _relative(measured: Array, simulated: Array) -> float:

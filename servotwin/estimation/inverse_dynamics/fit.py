@@ -35,7 +35,7 @@ class ParameterFit:
         friction and offset (N; N m), the offset as a force that resists the forward motion.
     values : (p,) array
     covariance : (p, p) array
-        By leaving out one part of the recording after the other; of `identify_drive` also of what a held command does.
+        By leaving out one part of the recording after the other.
     freedom : (p,) array
         Degrees of freedom of the variances.
     relative_error : float
@@ -56,6 +56,12 @@ class ParameterFit:
     def __getitem__(self, name: str) -> float:
         """Value of a parameter."""
         return float(self.values[self.names.index(name)])
+
+    def only(self, names: tuple[str, ...]) -> ParameterFit:
+        """The fit of some of its parameters, with what the others do to their covariance."""
+        at = [self.names.index(name) for name in names]
+        covariance = self.covariance[np.ix_(at, at)]
+        return replace(self, names=names, values=self.values[at], covariance=covariance, freedom=self.freedom[at])
 
     def std(self, name: str) -> float:
         """Standard deviation of a parameter."""
@@ -99,20 +105,23 @@ class Rows(NamedTuple):
         Number of each row's block of time.
     places : (r,) int array
         Number of each row's part of the travel.
+    extra : (r, e) array
+        Further regressors of both models.
     """
 
     design: Array
     force: Array
     blocks: Groups
     places: Groups
+    extra: Array
 
 
 def rows_of(
     recording: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float, extra: Array | None = None
 ) -> Rows:
-    """Rows of a recording for a motion; `cycle` is the duration of one cycle of it, s, `extra` a first regressor."""
-    first = [] if extra is None else [extra]
-    columns = np.column_stack([*first, regressors(motion), recording.force])
+    """Rows of a recording for a motion; `cycle` is the duration of one cycle of it, s, `extra` (n, e) regressors."""
+    further = np.empty((motion.speed.size, 0)) if extra is None else extra
+    columns = np.column_stack([regressors(motion), further, recording.force])
     rows, times = filtered_rows(columns, ~motion.resting, recording.usable, recording.rate, band)
     if len(rows) < _LEAST_ROWS:
         raise InvalidInput(
@@ -120,7 +129,8 @@ def rows_of(
             f"of at least {_LEAST_ROWS}: record a longer motion"
         )
     position = recording.position[np.round(times * recording.rate).astype(int)]
-    return Rows(rows[:, :-1], rows[:, -1], _blocks(times, cycle, rows), _places(position))
+    blocks, ends = _blocks(times, cycle, rows), len(SYMMETRIC) + len(ASYMMETRIC)
+    return Rows(rows[:, :ends], rows[:, -1], blocks, _places(position), rows[:, ends:-1])
 
 
 def joined(every: Sequence[Rows]) -> Rows:
@@ -136,12 +146,13 @@ def joined(every: Sequence[Rows]) -> Rows:
     )
 
 
-def fit_models(rows: Rows) -> tuple[ParameterFit, ParameterFit]:
-    """Fit the symmetric and the asymmetric model."""
+def fit_models(rows: Rows, extra: tuple[str, ...] = ()) -> tuple[ParameterFit, ParameterFit]:
+    """Fit the symmetric and the asymmetric model, both with the extra regressors, whose parameters come last."""
     ends = len(SYMMETRIC)
+    symmetric, asymmetric = (np.column_stack([part, rows.extra]) for part in np.split(rows.design, [ends], axis=1))
     return (
-        least_squares(SYMMETRIC, rows.design[:, :ends], rows),
-        least_squares(ASYMMETRIC, rows.design[:, ends:], rows),
+        least_squares((*SYMMETRIC, *extra), symmetric, rows),
+        least_squares((*ASYMMETRIC, *extra), asymmetric, rows),
     )
 
 

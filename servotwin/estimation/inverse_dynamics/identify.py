@@ -9,21 +9,21 @@ from dataclasses import dataclass, replace
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
-from servotwin.estimation.inverse_dynamics.command_delay import delay_remark
+from servotwin.estimation.inverse_dynamics.command_delay import NEAR, delay_remark, fitted_delay
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
+from servotwin.estimation.inverse_dynamics.hidden_shaft import hidden_shaft
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
-from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
+from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 GivenLaw = GivenGains | GivenPid
 _FITTED, _FITTED_PID = GivenGains(), GivenPid()
 # Of the force: the PID that ran left a thousandth, one fitted to a cascade's log a fifth.
 _PID_LEAVES = 0.05
-# With 1 inertias of thinned logs were up to 1.5 half-widths off, with 2 up to 0.9.
-_LAW_COUNTS = 2.0
+_LAW_COUNTS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,9 @@ class IdentifiedDrive:
     split : ParameterFit or None
         With the inertias before and behind the shaft; None: the recording shows no elasticity.
     late : str
-        By how much command and position of the first recording are not of one time; empty: they are.
+        By how much the command moves the drive at another time than it was logged; empty: it does not for sure.
+    elastic : str
+        Elasticity that the only encoder shows; empty: none for sure.
     """
 
     symmetric: ParameterFit
@@ -61,6 +63,7 @@ class IdentifiedDrive:
     shaft: ShaftResponse | None = None
     split: ParameterFit | None = None
     late: str = ""
+    elastic: str = ""
 
 
 def identify_drive(
@@ -85,7 +88,7 @@ def identify_drive(
         A recording does not show the parameters: no motion, one direction or one speed only, a command at its limit, of
         the wrong sign or of something else.
     """
-    used, rows, held, motions, bands = [], [], [], [], []
+    used, rows, motions, bands = [], [], [], []
     for each in recordings:
         checks.check_motion(each)
         band = band_of(each)
@@ -99,22 +102,30 @@ def identify_drive(
         bands.append(band)
         rows.append(rows_of(each, motion, band, cycle_time(motion)))
         checks.check_one_drive(each, rows[-1])
-        held.append(rows_of(held_command(each), motion, band, cycle_time(motion)))
     every = joined(rows)
     checks.check_separable(used[0], every)
-    others = fit_models(joined(held))
-    fits = fit_models(every)
-    symmetric, asymmetric = (widened(*both) for both in zip(fits, others, strict=True))
-    checks.check_sense(used[0], fits[0])
-    law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
+    checks.check_sense(used[0], fit_models(every)[0])
+    late = fitted_delay(used, motions, bands)
+    symmetric, asymmetric = late.symmetric, late.asymmetric
+    lag = max(late.beyond_hold(used[0].rate), 0.0)
+    hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late.delay)
+    if hidden is not None:
+        symmetric, asymmetric = (widened(*both) for both in zip((symmetric, asymmetric), hidden.rigid, strict=True))
+    law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p, lag)
     if refinement is not None:
-        refinement = _with_its_law(refinement, fits)
-    # No further motion shows more of what the hold does.
-    advice = next_experiment(fits[0], every, motions[0], used[0].unit)
-    late = delay_remark(used[0], motions[0], bands[0])
+        refinement = _with_its_law(refinement, (symmetric, asymmetric), used[0].rate)
+    advice = next_experiment(late.statistical, every, motions[0], used[0].unit)
+    if refinement is not None and hidden is not None:
+        both = (refinement.symmetric, refinement.asymmetric)
+        stiff, sided = (widened(*each) for each in zip(both, hidden.rigid, strict=True))
+        refinement = replace(refinement, symmetric=stiff, asymmetric=sided)
+    simulated = refinement.lag if refinement is not None and refinement.converged else None
+    words = delay_remark(late, simulated, used[0].rate, bands[0].corner)
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
-    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split, late)
+    return IdentifiedDrive(
+        symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split, words, str(hidden or "")
+    )
 
 
 def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
@@ -134,7 +145,12 @@ def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
 
 
 def _refined(
-    recording: DriveRecording, fit: ParameterFit, gains: GivenLaw, filtering: tuple[RegressionBand, float], p: float
+    recording: DriveRecording,
+    fit: ParameterFit,
+    gains: GivenLaw,
+    filtering: tuple[RegressionBand, float],
+    p: float,
+    lag: float,
 ) -> tuple[FittedLaw | None, Refinement | None, tuple[str, ...]]:
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
@@ -144,20 +160,22 @@ def _refined(
     if not law.explains:
         checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
         return (law if gains.complete else None), None, (_unexplained(law, gains),)
-    found = refine(fit, law, recording, *filtering, p)
+    found = refine(fit, law, recording, *filtering, p, lag)
     if found is None:
         return law, None, ("the simulated loop does not follow the log",)
     return law, found, () if found.converged else ("the fit to the simulated motion did not converge",)
 
 
-def _with_its_law(found: Refinement, first: tuple[ParameterFit, ParameterFit]) -> Refinement:
+def _with_its_law(found: Refinement, first: tuple[ParameterFit, ParameterFit], rate: float) -> Refinement:
     """The refinement, its intervals with what a law does that is not quite the one that ran.
 
     Where its law ran at the log's rate the simulated loop leaves a hundredth of what inverse dynamics leaves, or less;
     a tenth to all of it where the log holds every second to tenth sample. The parameters are as uncertain as they
-    differ from those of inverse dynamics, by twice that share.
+    differ from those of inverse dynamics, by three times that share;
+    by all of it where the drive has a lag, which may be a delay as well.
     """
     share = min(1.0, _LAW_COUNTS * found.symmetric.relative_error / first[0].relative_error)
+    share = 1.0 if found.lag > NEAR / rate else share
     both = zip((found.symmetric, found.asymmetric), first, strict=True)
     symmetric, asymmetric = (widened(fit, other, share) for fit, other in both)
     return replace(found, symmetric=symmetric, asymmetric=asymmetric)

@@ -147,7 +147,7 @@ def split_inertia(recording: DriveRecording, band: RegressionBand, shaft: ShaftR
     behind = np.interp(places + later, places, load.acceleration)
     # A controller holds its command for a sample: around the position's instant acts the mean of two.
     held = 0.5 * (recording.force + np.concatenate([recording.force[:1], recording.force[:-1]]))
-    rows = rows_of(replace(recording, force=held), motor, wide, cycle_time(motor), behind)
-    fit = least_squares(SPLIT, rows.design[:, : len(SPLIT)], rows)
+    rows = rows_of(replace(recording, force=held), motor, wide, cycle_time(motor), behind[:, None])
+    fit = least_squares(SPLIT, np.column_stack([rows.extra, rows.design[:, : len(SPLIT) - 1]]), rows)
     sure = all(fit[name] > fit.half_width(name) for name in ("load_inertia", "motor_inertia"))
     return fit if sure else None

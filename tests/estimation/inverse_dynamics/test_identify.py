@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drive_recordings import GAINS, PARAMETERS, prescribed, recording_of, simulated, strokes
+from drive_recordings import GAINS, PARAMETERS, elastic, prescribed, recording_of, simulated, strokes
 
 import servotwin as st
 from servotwin.errors import InvalidInput
@@ -178,8 +178,35 @@ def test_a_command_that_is_not_of_the_positions_time_is_told(shift):
     log = prescribed()
     found = identify_drive([replace(log, force=np.roll(log.force, -shift))])
     sense = "later" if shift > 0 else "earlier"
-    assert re.search(rf"best (3[6-9]|4\d)\.?\d* ms {sense} than it was logged", found.late)
+    assert re.search(rf"the command moves the drive about 40 ms {sense} than it was logged", found.late)
+    assert found.symmetric["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=0.02)
     assert identify_drive([log]).late == ""
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(1, 0.0), (3, 0.0), (0, 0.0005), (0, 0.0015)])
+def test_intervals_hold_where_the_drive_is_late(delay, lag):
+    """By whole samples of half a millisecond, or by the lag of a current loop: friction was outside."""
+    drive = identify_drive([simulated(rate=2000.0, delay=delay, lag=lag)], p=P)
+    milliseconds = 0.5 * delay + 1e3 * lag + 0.25  # held, a command acts half a sample later
+    assert float(re.search(r"about ([\d.]+) ms later", drive.late).group(1)) == pytest.approx(milliseconds, rel=0.15)
+    for fit in (drive.symmetric, drive.refinement.symmetric):
+        for name, true in PARAMETERS.items():
+            assert abs(fit[name] - true) <= fit.half_width(name), name
+    if delay == 0:
+        assert drive.refinement.lag == pytest.approx(lag, abs=2e-4)
+    assert identify_drive([simulated(rate=2000.0)], p=P).late == ""
+
+
+@pytest.mark.parametrize(("stiffness", "shake"), [(2e5, 1e-4), (4e4, 0.0), (1.2e5, 0.0)])
+def test_an_elasticity_behind_the_only_encoder_is_told_and_widens_the_inertia(stiffness, shake):
+    """Of a shaken axis the inertia of the rigid model was three half-widths off."""
+    log = replace(elastic(stiffness, 40.0, shake=shake), load=None)
+    drive = identify_drive([log], p=P)
+    found = float(re.search(r"resonance of about ([\d.]+) Hz", drive.elastic).group(1))
+    assert found == pytest.approx(math.sqrt(stiffness / 12.0) / (2.0 * math.pi), rel=0.2)
+    for fit in (drive.symmetric, drive.refinement.symmetric):
+        assert abs(fit["inertia"] - 20.0) <= fit.half_width("inertia")
+    assert identify_drive([prescribed()]).elastic == ""
 
 
 def test_a_fit_that_runs_away_is_left_for_the_one_before_the_simulation():
