@@ -46,8 +46,8 @@ class HiddenShaft:
     def __str__(self) -> str:
         """One sentence."""
         return (
-            f"the machine behind this encoder has an elasticity, of a resonance of about {self.resonance:.2g} Hz with "
-            "the motor held, which the axis does not have; the intervals contain what it does to the parameters; "
+            f"the command fits a machine with an elasticity better than a rigid one: a resonance of about "
+            f"{self.resonance:.2g} Hz with the motor held, which the axis does not have; the intervals contain what it does to the parameters; "
             "record a second encoder at the load"
         )
 
