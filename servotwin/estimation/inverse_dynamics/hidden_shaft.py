@@ -47,7 +47,8 @@ class HiddenShaft:
         """One sentence."""
         return (
             f"the command fits a machine with an elasticity better than a rigid one: a resonance of about "
-            f"{self.resonance:.2g} Hz with the motor held, which the axis does not have; the intervals contain what it does to the parameters; "
+            f"{self.resonance:.2g} Hz with the motor held, which the axis does not have; "
+            "the intervals contain what it does to the parameters; "
             "record a second encoder at the load"
         )
 
