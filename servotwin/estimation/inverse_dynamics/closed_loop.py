@@ -37,7 +37,7 @@ from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 
 FittedLaw = FittedCascade | FittedPid
-_ROUNDS = 12
+_ROUNDS, _LATE_ROUNDS = 8, 12
 _CONVERGED = 1e-3  # relative change of inertia and Coulomb friction, of the force
 _RESTS, _LEAST_LAG = 0.1, 0.01  # samples: change of the lag, least lag
 _TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
@@ -143,25 +143,28 @@ def refine(
 ) -> Refinement | None:
     """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track, or
     the fit leaves what an axis can be.
+
+    A lag (s) is fitted beside them, from its first value; 0: the drive follows its command at once.
     """
     fit, found = first, None
-    for _ in range(_ROUNDS):
+    late = lag > 0.0
+    for _ in range(_LATE_ROUNDS if late else _ROUNDS):
         simulated = simulated_log(rigid_axis(fit, law, recording, p, lag), fit["offset"], recording, band)
         if not simulated.position_error < _TRACKS:
             return None
         motion = motion_of(simulated.position, recording.rate, band)
-        both = fit_models(_rows(recording, motion, band, cycle, fit, simulated), DELAY)
+        both = fit_models(_rows(recording, motion, band, cycle, fit, simulated), DELAY if late else ())
         symmetric, asymmetric = both[0].only(SYMMETRIC), both[1].only(ASYMMETRIC)
         change = np.abs(symmetric.values - fit.values)
         converged = bool(np.all(change < _CONVERGED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
-        slower = both[0]["delay"] if lag > 0.0 else 0.0  # else the command's derivative stands for what is left
+        slower = both[0]["delay"] if late else 0.0
         converged = converged and abs(slower) <= _RESTS / recording.rate
         found, fit = Refinement(symmetric, asymmetric, simulated, converged, lag), symmetric
         if not symmetric["inertia"] > 0.0:  # it runs away, towards an axis that cannot be
             return None
         if converged:
             break
-        lag = max(lag + slower, _LEAST_LAG / recording.rate) if lag > 0.0 else 0.0
+        lag = max(lag + slower, _LEAST_LAG / recording.rate) if late else 0.0
     return found
 
 

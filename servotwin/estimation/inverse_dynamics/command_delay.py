@@ -67,16 +67,17 @@ class CommandDelay:
 def delay_remark(late: CommandDelay, lag: float | None, rate: float, corner: float) -> str:
     """Say that the command moves the drive at another time than it was logged; empty: not for sure.
 
-    `lag` is that of the simulated loop (s; None: there is none), which reversals do not make wrong as they make the
-    delay of inverse dynamics wrong, by a part of the period of its filter's corner (Hz).
+    `lag` is that of the simulated loop (s; None: there is none, or its law is not the one that ran). Reversals do not
+    make it wrong as they make the delay of inverse dynamics wrong, by a part of the period of its filter's corner (Hz).
     """
     held = _HOLD / rate
-    sure = late.beyond_hold(rate, _REVERSAL / corner) != 0.0 if lag is None else lag > NEAR / rate
+    early = late.delay < 0.0
+    sure = late.beyond_hold(rate, _REVERSAL / corner) != 0.0 if lag is None or early else lag > NEAR / rate
     if not sure:
         return ""
-    delay = late.delay if lag is None else lag + held
+    delay = late.delay if lag is None or early else lag + held
     sense, cause = "later", "a delay or lag of the drive" + (", or clocks that differ" if lag is None else "")
-    if delay < 0.0:
+    if early:
         sense, cause = "earlier", "command and position have different clocks; record both on one"
     return (
         f"the command moves the drive about {1e3 * abs(delay):.2g} ms {sense} than it was logged, of which holding it "

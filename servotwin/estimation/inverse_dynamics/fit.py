@@ -35,7 +35,8 @@ class ParameterFit:
         friction and offset (N; N m), the offset as a force that resists the forward motion.
     values : (p,) array
     covariance : (p, p) array
-        By leaving out one part of the recording after the other.
+        By leaving out one part of the recording after the other; of `identify_drive` also of what a held command does,
+        or the delay of a late one.
     freedom : (p,) array
         Degrees of freedom of the variances.
     relative_error : float
@@ -148,8 +149,9 @@ def joined(every: Sequence[Rows]) -> Rows:
 
 def fit_models(rows: Rows, extra: tuple[str, ...] = ()) -> tuple[ParameterFit, ParameterFit]:
     """Fit the symmetric and the asymmetric model, both with the extra regressors, whose parameters come last."""
-    ends = len(SYMMETRIC)
-    symmetric, asymmetric = (np.column_stack([part, rows.extra]) for part in np.split(rows.design, [ends], axis=1))
+    symmetric, asymmetric = np.split(rows.design, [len(SYMMETRIC)], axis=1)
+    if extra:
+        symmetric, asymmetric = (np.column_stack([part, rows.extra]) for part in (symmetric, asymmetric))
     return (
         least_squares((*SYMMETRIC, *extra), symmetric, rows),
         least_squares((*ASYMMETRIC, *extra), asymmetric, rows),

@@ -14,16 +14,20 @@ from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, b
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
-from servotwin.estimation.inverse_dynamics.hidden_shaft import hidden_shaft
+from servotwin.estimation.inverse_dynamics.hidden_shaft import HiddenShaft, hidden_shaft
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
-from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 GivenLaw = GivenGains | GivenPid
 _FITTED, _FITTED_PID = GivenGains(), GivenPid()
 # Of the force: the PID that ran left a thousandth, one fitted to a cascade's log a fifth.
 _PID_LEAVES = 0.05
-_LAW_COUNTS = 3.0
+# With 1 inertias of thinned logs were up to 1.5 half-widths off, with 2 up to 0.9.
+_LAW_COUNTS = 2.0
+# Of the command. Noise of a record, which the loop had not, left 0.02 to 0.08, and made lags of 0.4 to 4 samples of
+# none; late drives left 0.0003.
+_THAT_RAN = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +92,7 @@ def identify_drive(
         A recording does not show the parameters: no motion, one direction or one speed only, a command at its limit, of
         the wrong sign or of something else.
     """
-    used, rows, motions, bands = [], [], [], []
+    used, rows, held, motions, bands = [], [], [], [], []
     for each in recordings:
         checks.check_motion(each)
         band = band_of(each)
@@ -102,29 +106,40 @@ def identify_drive(
         bands.append(band)
         rows.append(rows_of(each, motion, band, cycle_time(motion)))
         checks.check_one_drive(each, rows[-1])
+        held.append(rows_of(held_command(each), motion, band, cycle_time(motion)))
     every = joined(rows)
     checks.check_separable(used[0], every)
-    checks.check_sense(used[0], fit_models(every)[0])
-    late = fitted_delay(used, motions, bands)
-    symmetric, asymmetric = late.symmetric, late.asymmetric
-    lag = max(late.beyond_hold(used[0].rate), 0.0)
-    hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late.delay)
-    if hidden is not None:
-        symmetric, asymmetric = (widened(*both) for both in zip((symmetric, asymmetric), hidden.rigid, strict=True))
-    law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p, lag)
-    if refinement is not None:
-        refinement = _with_its_law(refinement, (symmetric, asymmetric), used[0].rate)
-    advice = next_experiment(late.statistical, every, motions[0], used[0].unit)
-    if refinement is not None and hidden is not None:
-        both = (refinement.symmetric, refinement.asymmetric)
-        stiff, sided = (widened(*each) for each in zip(both, hidden.rigid, strict=True))
-        refinement = replace(refinement, symmetric=stiff, asymmetric=sided)
-    simulated = refinement.lag if refinement is not None and refinement.converged else None
-    words = delay_remark(late, simulated, used[0].rate, bands[0].corner)
+    fits = fit_models(every)
+    checks.check_sense(used[0], fits[0])
+    law, doubts = _law(used[0], gains)
+    simulated = None if doubts else law, used[0], (bands[0], cycle_time(motions[0])), p
+    late, words = fitted_delay(used, motions, bands), ""
+    behind = late.beyond_hold(used[0].rate)
+    if behind != 0.0:
+        found = _refined((late.symmetric, late.asymmetric), *simulated, max(behind, 0.0))
+        lag = found.lag if law is not None and law.left < _THAT_RAN else None
+        words = delay_remark(late, lag, used[0].rate, bands[0].corner)
+    if not words:
+        others = fit_models(joined(held))
+        found = _refined((widened(fits[0], others[0]), widened(fits[1], others[1])), *simulated, 0.0)
+    # No further motion shows more of what the hold does.
+    advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
+    hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late)
+    found = found.with_shaft(hidden)
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
     return IdentifiedDrive(
-        symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split, words, str(hidden or "")
+        found.symmetric,
+        found.asymmetric,
+        tuple(bands),
+        law,
+        found.refinement,
+        doubts or found.doubts,
+        advice,
+        shaft,
+        split,
+        words,
+        str(hidden or ""),
     )
 
 
@@ -144,26 +159,60 @@ def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
     return cascade if pid == _FITTED_PID else pid
 
 
+@dataclass(frozen=True, eq=False)
+class _Fits:
+    """Both models by inverse dynamics, the refinement, and why there is none."""
+
+    symmetric: ParameterFit
+    asymmetric: ParameterFit
+    refinement: Refinement | None
+    doubts: tuple[str, ...]
+
+    @property
+    def lag(self) -> float | None:
+        """Of the simulated loop, s; None: there is none that can be taken."""
+        return self.refinement.lag if self.refinement is not None and self.refinement.converged else None
+
+    def with_shaft(self, hidden: HiddenShaft | None) -> _Fits:
+        """These, their intervals with what a shaft behind the only encoder does."""
+        if hidden is None:
+            return self
+        symmetric, asymmetric = hidden.rigid
+        refined = self.refinement
+        if refined is not None:
+            both = widened(refined.symmetric, symmetric), widened(refined.asymmetric, asymmetric)
+            refined = replace(refined, symmetric=both[0], asymmetric=both[1])
+        return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
+
+
 def _refined(
+    fits: tuple[ParameterFit, ParameterFit],
+    law: FittedLaw | None,
     recording: DriveRecording,
-    fit: ParameterFit,
-    gains: GivenLaw,
     filtering: tuple[RegressionBand, float],
     p: float,
     lag: float,
-) -> tuple[FittedLaw | None, Refinement | None, tuple[str, ...]]:
-    """The law that ran, the refinement, and why there is none."""
+) -> _Fits:
+    """The fits and their refinement, if there is a law that explains the command."""
+    if law is None:
+        return _Fits(*fits, None, ())
+    found = refine(fits[0], law, recording, *filtering, p, lag)
+    if found is None:
+        return _Fits(*fits, None, ("the simulated loop does not follow the log",))
+    doubts = () if found.converged else ("the fit to the simulated motion did not converge",)
+    return _Fits(*fits, _with_its_law(found, fits, recording.rate), doubts)
+
+
+def _law(recording: DriveRecording, gains: GivenLaw) -> tuple[FittedLaw | None, tuple[str, ...]]:
+    """The law that ran or is stated, and why its loop cannot be simulated."""
     if recording.reference is None:
         given = _fitted_law(recording, gains) if gains.complete else None
-        return given, None, ("without a reference the loop cannot be simulated",)
+        return given, ("without a reference the loop cannot be simulated",)
     law = _fitted_law(recording, gains)
-    if not law.explains:
-        checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
-        return (law if gains.complete else None), None, (_unexplained(law, gains),)
-    found = refine(fit, law, recording, *filtering, p, lag)
-    if found is None:
-        return law, None, ("the simulated loop does not follow the log",)
-    return law, found, () if found.converged else ("the fit to the simulated motion did not converge",)
+    if law.explains:
+        return law, ()
+    checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
+    return (law if gains.complete else None), (_unexplained(law, gains),)
 
 
 def _with_its_law(found: Refinement, first: tuple[ParameterFit, ParameterFit], rate: float) -> Refinement:
@@ -171,8 +220,8 @@ def _with_its_law(found: Refinement, first: tuple[ParameterFit, ParameterFit], r
 
     Where its law ran at the log's rate the simulated loop leaves a hundredth of what inverse dynamics leaves, or less;
     a tenth to all of it where the log holds every second to tenth sample. The parameters are as uncertain as they
-    differ from those of inverse dynamics, by three times that share;
-    by all of it where the drive has a lag, which may be a delay as well.
+    differ from those of inverse dynamics, by twice that share; by all of it where the drive has a lag, which may be a
+    delay as well.
     """
     share = min(1.0, _LAW_COUNTS * found.symmetric.relative_error / first[0].relative_error)
     share = 1.0 if found.lag > NEAR / rate else share

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,3 +70,13 @@ class DriveRecording:
         if self.force_per_command is None:
             return self.command_unit or "command"
         return "N m" if self.rotary else "N"
+
+
+def held_command(recording: DriveRecording) -> DriveRecording:
+    """The recording with the force that moves the drive about each sample if the command is held from one to the next.
+
+    It is the mean of the command that ends there and of the one that begins: of a held force the second difference of
+    the position is exactly that.
+    """
+    before = np.concatenate([recording.force[:1], recording.force[:-1]])
+    return replace(recording, force=0.5 * (recording.force + before))

@@ -209,6 +209,27 @@ def test_an_elasticity_behind_the_only_encoder_is_told_and_widens_the_inertia(st
     assert identify_drive([prescribed()]).elastic == ""
 
 
+@pytest.mark.parametrize("seed", [1063, 1180, 1197])
+def test_cyclic_friction_is_no_elasticity(seed):
+    """Of these rigid machines it was told."""
+    assert identify_drive([prescribed(seed)]).elastic == ""
+
+
+@pytest.mark.parametrize(("noise", "rate"), [(0.0, 500.0), (0.0, 1000.0), (0.5, 1000.0), (2.0, 2000.0)])
+def test_a_drive_that_is_not_late_is_fitted_to_the_command_as_it_was_logged(noise, rate):
+    """Noise of the record, which the loop had not, looked like a lag of up to four samples."""
+    random, log = np.random.default_rng(7), simulated(rate=rate)
+    position = log.position + 1e-6 * noise * random.standard_normal(log.position.size)
+    force = log.force + noise * random.standard_normal(log.force.size)
+    drive = identify_drive([replace(log, position=position, force=force)], p=P)
+    assert drive.late == ""
+    assert drive.refinement.lag == 0.0
+    assert drive.elastic == ""
+    if noise == 0.0:
+        assert drive.refinement.symmetric["inertia"] == pytest.approx(20.0, rel=2e-4)
+        assert drive.refinement.symmetric.half_width("inertia") < 0.02
+
+
 def test_a_fit_that_runs_away_is_left_for_the_one_before_the_simulation():
     """A reference in steps of 10 ms shakes the motor alone; its simulated fit left what an axis can be."""
     p = 0.02 / (2.0 * math.pi)
