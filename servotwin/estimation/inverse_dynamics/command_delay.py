@@ -71,7 +71,7 @@ def delay_remark(late: CommandDelay, lag: float | None, rate: float, corner: flo
     make it wrong as they make the delay of inverse dynamics wrong, by a part of the period of its filter's corner (Hz).
     """
     held = _HOLD / rate
-    early = late.delay < 0.0
+    early = late.delay < 0.0 and (lag is None or lag <= NEAR / rate)
     sure = late.beyond_hold(rate, _REVERSAL / corner) != 0.0 if lag is None or early else lag > NEAR / rate
     if not sure:
         return ""

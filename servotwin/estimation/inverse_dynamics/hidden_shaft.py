@@ -29,9 +29,9 @@ _DAMPING = 0.05
 _HIGHEST = 0.1  # of the sample rate: beyond, derivatives of samples look like a shaft
 _LOAD = ("load_inertia",)
 _LEAST = 0.05  # of the inertia: with cyclic friction 19 of 200 rigid machines seemed to have 0.004 to 0.03 on a shaft
-# Told is what is twice its 95 % interval and explains so much of the squares that the rigid model leaves: those 19 were
-# at most 1.6 intervals, EMPS is 1.9 and explains 0.02; moves of 8 periods of a resonance 2.4 or more, and 0.1 or more.
-_SURE, _EXPLAINS = 2.0, 0.05
+# Told is what is twice its 95 % interval and explains so much of the squares that the rigid model leaves, or much of
+# them: those 19 were at most 1.6 intervals and explained 0.11, EMPS is 1.9 and 0.02.
+_SURE, _EXPLAINS, _MUCH = 2.0, 0.05, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,8 @@ class HiddenShaft:
     def sure(self) -> bool:
         """If it is evident enough to be told."""
         fit = self.symmetric
-        return fit["load_inertia"] > _SURE * fit.half_width("load_inertia") and self.explained > _EXPLAINS
+        known = fit["load_inertia"] > _SURE * fit.half_width("load_inertia")
+        return self.explained > (_EXPLAINS if known else _MUCH)
 
     @property
     def rigid(self) -> tuple[ParameterFit, ParameterFit]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
-from servotwin.estimation.inverse_dynamics.command_delay import NEAR, delay_remark, fitted_delay
+from servotwin.estimation.inverse_dynamics.command_delay import NEAR, CommandDelay, delay_remark, fitted_delay
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
@@ -28,6 +28,7 @@ _LAW_COUNTS = 2.0
 # Of the command. Noise of a record, which the loop had not, left 0.02 to 0.08, and made lags of 0.4 to 4 samples of
 # none; late drives left 0.0003.
 _THAT_RAN = 0.005
+_FIRST_LAG = 0.5  # samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +116,12 @@ def identify_drive(
     simulated = None if doubts else law, used[0], (bands[0], cycle_time(motions[0])), p
     late, words = fitted_delay(used, motions, bands), ""
     behind = late.beyond_hold(used[0].rate)
-    if behind != 0.0:
-        found = _refined((late.symmetric, late.asymmetric), *simulated, max(behind, 0.0))
-        lag = found.lag if law is not None and law.left < _THAT_RAN else None
+    that_ran = law is not None and not doubts and law.left < _THAT_RAN
+    if behind != 0.0 or that_ran:
+        # Reversals hide a delay from inverse dynamics, and not from the simulated loop.
+        start = max(behind, _FIRST_LAG / used[0].rate if that_ran and behind == 0.0 else 0.0)
+        found = _refined((late.symmetric, late.asymmetric), *simulated, start)
+        lag = found.lag if that_ran else None
         words = delay_remark(late, lag, used[0].rate, bands[0].corner)
     if not words:
         others = fit_models(joined(held))
@@ -125,7 +129,7 @@ def identify_drive(
     # No further motion shows more of what the hold does.
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
     hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late)
-    found = found.with_shaft(hidden)
+    found = found.with_shaft(hidden, late)
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
     return IdentifiedDrive(
@@ -173,7 +177,7 @@ class _Fits:
         """Of the simulated loop, s; None: there is none that can be taken."""
         return self.refinement.lag if self.refinement is not None and self.refinement.converged else None
 
-    def with_shaft(self, hidden: HiddenShaft | None) -> _Fits:
+    def with_shaft(self, hidden: HiddenShaft | None, late: CommandDelay) -> _Fits:
         """These, their intervals with what a shaft behind the only encoder does."""
         if hidden is None:
             return self
@@ -182,6 +186,9 @@ class _Fits:
         if refined is not None:
             both = widened(refined.symmetric, symmetric), widened(refined.asymmetric, asymmetric)
             refined = replace(refined, symmetric=both[0], asymmetric=both[1])
+        if not hidden.sure:  # what it does beside a delay that is not sure either
+            symmetric = replace(symmetric, values=self.symmetric.values + symmetric.values - late.symmetric.values)
+            asymmetric = replace(asymmetric, values=self.asymmetric.values + asymmetric.values - late.asymmetric.values)
         return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
 
 
