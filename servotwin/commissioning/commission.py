@@ -121,9 +121,7 @@ def commission(
     travel = 1.0 if read[0].travel is None else read[0].travel
     drive = _without_hidden_shaft(read[0], identify_drive([each.recording for each in read], gains, travel, applied))
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
-    refined = drive.refinement
-    late = refined is not None and refined.converged and bool(drive.late)
-    lag = refined.lag if refined is not None and late else 0.0
+    lag = drive.refinement.lag if drive.refinement is not None and drive.refinement.converged else 0.0
     axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel, lag)
     if axis is not None and drive.shaft is not None and drive.split is not None:
         axis = _with_shaft(axis, drive.shaft, drive.split)

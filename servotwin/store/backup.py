@@ -21,7 +21,7 @@ from servotwin.store.integrity import STORED_BODIES, body_fault
 from servotwin.store.migrate import VERSIONS, checked_revision
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION, metadata
-from servotwin.store.stored_value import WrongType, wrong_value
+from servotwin.store.stored_value import WrongValue, wrong_value
 
 PAGES = 2048
 """Pages copied between two progress reports."""
@@ -217,7 +217,7 @@ def _check_revision(connection: sqlite3.Connection, path: Path) -> None:
     named = connection.execute(f"SELECT version_num FROM {VERSIONS}").fetchone()
     try:
         revision = checked_revision(named and named[0])
-    except WrongType as error:
+    except WrongValue as error:
         raise InvalidInput(f"store {path}: is damaged ({error})") from None
     if revision > REVISION:
         raise InvalidInput(f"store {path}: its schema {revision} is newer than {REVISION}, the newest known here")

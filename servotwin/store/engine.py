@@ -26,7 +26,7 @@ from servotwin.errors import InvalidInput, ResourceUnavailable
 from servotwin.runtime import sqlite_damage
 from servotwin.runtime.files import FilesInPlace
 from servotwin.runtime.sqlite_damage import damage_words
-from servotwin.store.stored_value import WrongType
+from servotwin.store.stored_value import WrongValue
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
@@ -198,7 +198,7 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
                 f"store {public_address(engine.url)}: is damaged ({damage_words(error.orig)})"
             ) from error.orig
         raise _unavailable(engine, str(error.orig)) from error.orig
-    except WrongType as error:
+    except WrongValue as error:
         raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error})") from error
     except (PoolTimeout, sqlite3.Error) as error:
         raise _unavailable(engine, str(error)) from None

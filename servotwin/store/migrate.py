@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import POSTGRESQL, public_address, transaction
 from servotwin.store.schema import REVISION, metadata
-from servotwin.store.stored_value import WrongType
+from servotwin.store.stored_value import WrongValue
 
 log = logging.getLogger(__name__)
 
@@ -70,11 +70,11 @@ def _revision(connection: sa.Connection) -> str | None:
 
 
 def checked_revision(revision: Any) -> str:
-    """Return the revision that a database names; raises WrongType where it is none."""
+    """Return the revision that a database names; raises WrongValue where it is none."""
     if isinstance(revision, str) and _REVISION.fullmatch(revision):
         return revision
     held = "nothing" if revision is None else "bytes" if isinstance(revision, bytes) else repr(revision)
-    raise WrongType(f"column {VERSIONS}.version_num holds {held} where the four digits of a schema belong")
+    raise WrongValue(f"column {VERSIONS}.version_num holds {held} where the four digits of a schema belong")
 
 
 def _check(connection: sa.Connection, current: str | None, to: str) -> None:

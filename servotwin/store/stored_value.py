@@ -20,7 +20,7 @@ _STORED = {
 """Types of SQLite's values that belong into columns of Python's."""
 
 
-class WrongType(Exception):
+class WrongValue(Exception):
     """A value was read that does not belong into its column, of another type or content. One clause."""
 
 
@@ -80,7 +80,7 @@ class StoredValue(sa.TypeDecorator[Any]):
         def check(value: Any) -> Any:
             if value is None or (type(value) in wanted and (content is None or content.test(value))):
                 return value
-            raise WrongType(_clause(column, kind, content, value))
+            raise WrongValue(_clause(column, kind, content, value))
 
         return check
 

@@ -135,16 +135,26 @@ def test_a_store_that_begins_on_an_empty_file_is_said_once(tmp_path: Path, caplo
     assert caplog.messages.count("new store") == 1
 
 
-@pytest.mark.parametrize("command", [["servos"], ["audit", "ax-1"], ["replay", "ax-1"], ["backup", "b.db"]])
-def test_a_text_that_is_none_is_said_as_damage_without_its_bytes(tmp_path: Path, command: list[str]) -> None:
-    config, file = twin_file(tmp_path), tmp_path / "twin.db"
+def changed_store(folder: Path, *changes: str) -> Path:
+    """File of a twin whose store holds four windows, after some changes to its rows."""
+    config, file = twin_file(folder), folder / "twin.db"
     store = open_store(str(file))
     store.put([window("ax-1", n) for n in range(4)])
     store.close()
     with closing(sqlite3.connect(file)) as writer:
-        writer.execute("UPDATE messages SET servo = CAST(x'61782d31ff' AS TEXT), encoding = CAST(x'ff' AS TEXT)")
-        writer.execute("UPDATE twins SET servo = CAST(x'61782d31ff' AS TEXT)")
+        for change in changes:
+            writer.execute(f"UPDATE {change}")
         writer.commit()
+    return config
+
+
+@pytest.mark.parametrize("command", [["servos"], ["audit", "ax-1"], ["replay", "ax-1"], ["backup", "b.db"]])
+def test_a_text_that_is_none_is_said_as_damage_without_its_bytes(tmp_path: Path, command: list[str]) -> None:
+    config = changed_store(
+        tmp_path,
+        "messages SET servo = CAST(x'61782d31ff' AS TEXT), encoding = CAST(x'ff' AS TEXT)",
+        "twins SET servo = CAST(x'61782d31ff' AS TEXT)",
+    )
     result = CliRunner().invoke(app, [*command, "--config", str(config)])
     assert result.exit_code == INVALID
     assert re.match(r"error: store .*: is damaged \(a text in column '\w+' is not UTF-8\)", result.stderr)
@@ -173,13 +183,7 @@ def test_a_value_of_another_type_is_said_as_damage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, change: str, why: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    config, file = twin_file(tmp_path), tmp_path / "twin.db"
-    store = open_store(str(file))
-    store.put([window("ax-1", n) for n in range(4)])
-    store.close()
-    with closing(sqlite3.connect(file)) as writer:
-        writer.execute(f"UPDATE {change}")
-        writer.commit()
+    config = changed_store(tmp_path, change)
     result = CliRunner().invoke(app, [*command.split(), "--config", str(config)])
     assert result.exit_code == INVALID
     assert re.fullmatch(rf"error: store .*: is damaged \((.*is damaged \()?{why}(, in .*)?\)+.*\n", result.stderr)
@@ -201,14 +205,8 @@ def test_a_value_that_cannot_be_is_said_as_damage_with_its_row(
 ) -> None:
     """A time far ahead ended `servos` and `audit` with a traceback."""
     monkeypatch.chdir(tmp_path)
-    config, file = twin_file(tmp_path), tmp_path / "twin.db"
-    store = open_store(str(file))
-    store.put([window("ax-1", n) for n in range(4)])
-    store.close()
     table, name = column.split(".")
-    with closing(sqlite3.connect(file)) as writer:
-        writer.execute(f"UPDATE {table} SET {name} = {value} WHERE rowid = 1")
-        writer.commit()
+    config = changed_store(tmp_path, f"{table} SET {name} = {value} WHERE rowid = 1")
     result = CliRunner().invoke(app, [*command.split(), "--config", str(config)])
     row = "servo 'ax-1'" if table == "twins" else "id 1"
     assert result.exit_code == INVALID

@@ -102,7 +102,7 @@ def under_cascade(axis: Axis, crossover: float) -> Axis:
     Raises
     ------
     InvalidInput
-        The controller is a linear law, the motor has no encoder, or the crossover is not positive and finite.
+        The controller is no filtered PID, the motor has no encoder, or the crossover is not positive and finite.
     """
     own = axis.pidf
     _check(crossover, crossover, math.pi / 2.0, 0.0)

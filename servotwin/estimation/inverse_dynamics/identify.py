@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
@@ -113,19 +114,12 @@ def identify_drive(
     fits = fit_models(every)
     checks.check_sense(used[0], fits[0])
     law, doubts = _law(used[0], gains)
-    simulated = None if doubts else law, used[0], (bands[0], cycle_time(motions[0])), p
-    late, words = fitted_delay(used, motions, bands), ""
-    behind = late.beyond_hold(used[0].rate)
-    that_ran = law is not None and not doubts and law.left < _THAT_RAN
-    if behind != 0.0 or that_ran:
-        # Reversals hide a delay from inverse dynamics, and not from the simulated loop.
-        start = max(behind, _FIRST_LAG / used[0].rate if that_ran and behind == 0.0 else 0.0)
-        found = _refined((late.symmetric, late.asymmetric), *simulated, start)
-        lag = found.lag if that_ran else None
-        words = delay_remark(late, lag, used[0].rate, bands[0].corner)
+    loop = _Loop(None if doubts else law, used[0], bands[0], cycle_time(motions[0]), p)
+    late = fitted_delay(used, motions, bands)
+    found, words = _late(late, loop)
     if not words:
         others = fit_models(joined(held))
-        found = _refined((widened(fits[0], others[0]), widened(fits[1], others[1])), *simulated, 0.0)
+        found = loop.refined((widened(fits[0], others[0]), widened(fits[1], others[1])), 0.0)
     # No further motion shows more of what the hold does.
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
     hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late)
@@ -192,22 +186,36 @@ class _Fits:
         return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
 
 
-def _refined(
-    fits: tuple[ParameterFit, ParameterFit],
-    law: FittedLaw | None,
-    recording: DriveRecording,
-    filtering: tuple[RegressionBand, float],
-    p: float,
-    lag: float,
-) -> _Fits:
-    """The fits and their refinement, if there is a law that explains the command."""
-    if law is None:
-        return _Fits(*fits, None, ())
-    found = refine(fits[0], law, recording, *filtering, p, lag)
-    if found is None:
-        return _Fits(*fits, None, ("the simulated loop does not follow the log",))
-    doubts = () if found.converged else ("the fit to the simulated motion did not converge",)
-    return _Fits(*fits, _with_its_law(found, fits, recording.rate), doubts)
+class _Loop(NamedTuple):
+    """The loop that is simulated along a recording; `law` is None where none explains the command."""
+
+    law: FittedLaw | None
+    recording: DriveRecording
+    band: RegressionBand
+    cycle: float
+    p: float
+
+    def refined(self, fits: tuple[ParameterFit, ParameterFit], lag: float) -> _Fits:
+        """Both models and their refinement, if there is one; a lag (s) is fitted where its first value is not 0."""
+        if self.law is None:
+            return _Fits(*fits, None, ())
+        found = refine(fits[0], self.law, self.recording, self.band, self.cycle, self.p, lag)
+        if found is None:
+            return _Fits(*fits, None, ("the simulated loop does not follow the log",))
+        doubts = () if found.converged else ("the fit to the simulated motion did not converge",)
+        return _Fits(*fits, _with_its_law(found, fits, self.recording.rate), doubts)
+
+
+def _late(late: CommandDelay, loop: _Loop) -> tuple[_Fits, str]:
+    """The fits with the command at its delay, and the sentence on that; empty: the delay is not evident."""
+    fits, rate = (late.symmetric, late.asymmetric), loop.recording.rate
+    behind = late.beyond_hold(rate)
+    # Reversals hide a delay from inverse dynamics, and not from the simulated loop.
+    that_ran = loop.law is not None and loop.law.left < _THAT_RAN
+    if behind == 0.0 and not that_ran:
+        return _Fits(*fits, None, ()), ""
+    found = loop.refined(fits, _FIRST_LAG / rate if behind == 0.0 else max(behind, 0.0))
+    return found, delay_remark(late, found.lag if that_ran else None, rate, loop.band.corner)
 
 
 def _law(recording: DriveRecording, gains: GivenLaw) -> tuple[FittedLaw | None, tuple[str, ...]]:
