@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from servotwin.analysis.tuning.candidates import CONTROLLER_TYPES
 from servotwin.analysis.tuning.cascade import tune_cascade, under_cascade
 from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
@@ -59,6 +60,8 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
         raise InvalidInput(f"phase margin {request.phase_margin_deg:g} deg: must be above 0 and below 180 deg")
     if request.output is not None:
         check_file(request.output, (".toml",))
+    if request.kind not in (types := (*CONTROLLER_TYPES, CASCADE)):
+        raise InvalidInput(f"--type {request.kind}: must be one of {', '.join(types)}")
     servo = resolve_plant(request.servo, tuned=False)
     if request.kind == CASCADE:
         servo = _with_cascade(servo, request)

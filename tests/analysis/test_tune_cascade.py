@@ -236,3 +236,9 @@ def test_the_paper_s_servo_has_no_cascade() -> None:
     options = TuneOptions("paper", "cascade", 4.0, 60.0, math.inf, "Ms", 0.0, 1.0, None)
     with pytest.raises(st.InvalidInput, match=r"--type cascade: paper is a servo, .* that of an axis"):
         print_tuning(options, as_json=False)
+
+
+def test_a_type_that_does_not_exist_names_those_that_do() -> None:
+    options = TuneOptions("paper", "Cascade", 4.0, 60.0, math.inf, "Ms", 0.0, 1.0, None)
+    with pytest.raises(st.InvalidInput, match="--type Cascade: must be one of P, PI, PD, PDF, PID, PIDF, cascade"):
+        print_tuning(options, as_json=False)
