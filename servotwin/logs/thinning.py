@@ -9,7 +9,7 @@ import numpy as np
 
 from servotwin.plant.signals import Array
 
-_STRETCH, _LEAST, _STRETCHES = 1024, 16, 16  # samples of a stretch, at least, and stretches that must fit
+_STRETCH, _LEAST, _STRETCHES = 32_768, 16, 16  # samples of a stretch, at least, and stretches that must fit
 
 _RESTS = 0.01  # of the way in another stretch
 _SEED = 14

@@ -1,14 +1,20 @@
 """Thinned logs: stretches at the full rate, and what a play remembers of the rest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recordings import recording
 
+from servotwin.estimation.driven_load.estimate import gap_of_driven_load
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.logs.gathering import THINNED, Gathering
 from servotwin.logs.thinning import Stretches, play_extremes
+from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
+from servotwin.plant.signals import SquareWave
+from servotwin.simulation import simulate
 
 
 @pytest.mark.random
@@ -65,3 +71,20 @@ def test_a_lag_far_below_the_steps_of_a_thinned_log_is_found(lag, speed):
     low, high = found.interval_motor
     assert low < 0.05 < high < low + 0.003
     assert found.lag == pytest.approx(lag, abs=2e-4)
+
+
+def test_a_log_of_an_hour_shows_the_swinging_load_that_five_minutes_show():
+    # Stretches of a second held no stroke of this motion: an hour was refused, where 60 s of it told the gap.
+    run = simulate(Axis.preset("two-mass-drive"), 300.0, reference=SquareWave(0.2, 4.0), gap=0.02, sample_rate=1000.0)
+    gathering = Gathering({})
+    for part in range(12):
+        motor, load = (1e-4 * np.round(angle[:-1] / 1e-4) for angle in (run.theta_m, run.position))
+        gathering.add(run.time[:-1] + 300.0 * part, {"motor": motor, "load": load})
+    clean = gathering.cleaned()
+    assert clean.found[THINNED] > 2_000_000
+    made = EncoderRecording(clean.time, *clean.channels.values(), motor_count=1e-4, load_count=1e-4, alone=clean.alone)
+    minute = replace(made, **{name: getattr(made, name)[:60_000] for name in ("time", "motor", "load", "alone")})
+    found = gap_of_driven_load(made, estimate_lost_motion(minute))
+    assert found.gap is not None, found.reason
+    low, high = found.gap.lost.interval_motor
+    assert low < 0.02 < high < 1.02 * low
