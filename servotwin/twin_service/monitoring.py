@@ -176,6 +176,9 @@ class Metrics:
         self.rejected = Counter(
             "servotwin_refused_total", "Messages and requests rejected, by reason code.", "code", known=list(Refusal)
         )
+        self.repeated = Counter(
+            "servotwin_requests_repeated_total", "Requests over the MQTT broker that had come before."
+        )
         self.commit = Histogram("servotwin_commit_seconds", "From a message's last byte to its commit.")
         self.age = Histogram("servotwin_queue_age_seconds", "From a message's commit to that of its result.")
         self.work = Histogram("servotwin_work_seconds", "A worker's time for one servo's messages.")
@@ -198,8 +201,8 @@ class Metrics:
             "servotwin_webhook_total", "Alarms that were posted, by outcome.", "outcome", known=_POSTED
         )
         self._all: list[Counter | Gauge | Histogram] = [
-            self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.receipts,
-            self.late, self.sent, self.workers_lost, self.missing, self.webhook,
+            self.stored, self.rejected, self.repeated, self.commit, self.age, self.work, self.results, self.evidence,
+            self.receipts, self.late, self.sent, self.workers_lost, self.missing, self.webhook,
         ]  # fmt: skip
 
     def add_gauge(

@@ -12,9 +12,11 @@ from typing import NamedTuple
 from uuid import uuid4
 
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.link.claim import HeldClaim
 from servotwin.link.mqtt_messages import (
     REQUEST_TOPICS,
     TWIN_GONE,
+    MqttRequest,
     MqttResponse,
     NotKnown,
     PollRequest,
@@ -38,7 +40,9 @@ from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.live_views import LiveIntake
+from servotwin.twin_service.monitoring import Counter
 from servotwin.twin_service.refusals import Refusals
+from servotwin.twin_service.request_serials import RequestSerials
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +90,8 @@ class MqttRequestHandler:
     wake : callable
         Wakes the dispatcher after a new message.
     refusals : Refusals
+    repeated : Counter
+        Of requests that came before.
     """
 
     def __init__(
@@ -97,9 +103,11 @@ class MqttRequestHandler:
         live: LiveIntake,
         wake: Callable[[], None],
         refusals: Refusals,
+        repeated: Counter,
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake = gate, ingest, polls, wake
         self._claims, self._live, self._refusals = claims, live, refusals
+        self._serials, self._repeated = RequestSerials(), repeated
 
     def decode(self, servo: str, data: bytes) -> ReceivedRequest | MqttAnswer:
         """Decode a request; where that fails, return the answer to it."""
@@ -117,11 +125,15 @@ class MqttRequestHandler:
     def _decoded(self, key: bytes, servo: str, data: bytes) -> ReceivedRequest | MqttAnswer:
         """Decode a request; where its edge is of a newer version, return a refusal. Raises InvalidMessage."""
         try:
-            return decode_request(key, servo, data)
+            request = decode_request(key, servo, data)
         except NotKnown as newer:
             self._refusals.log(newer.refusal, servo, True, why=str(newer))
             refused = RefusedResponse(newer.refusal, str(newer)[:_LONGEST_DETAIL])
             return MqttAnswer(encode_response(key, servo, newer.serial, refused), f"owner {servo}")
+        if self._serials.is_new(servo, _run_of(request.content), request.serial):
+            return request
+        self._repeated.add()
+        return MqttAnswer(None)  # whoever has no answer yet asks under another serial
 
     def refuse_topic(self, topic: str) -> None:
         """Count and log a message to a topic that is no servo's; there is nobody to answer."""
@@ -167,6 +179,14 @@ class MqttRequestHandler:
             self._wake()
         is_window = incoming.kind is MessageKind.WINDOW
         return PutResponse(self._ingest.older_pause(servo, question.waiting) if is_window else 0.0)
+
+
+def _run_of(request: MqttRequest) -> str:
+    """Run of the edge that makes a request; empty: it does not say."""
+    if isinstance(request, PollRequest) and request.question is not None:
+        return request.question.run
+    held = HeldClaim.from_text(request.claim)
+    return "" if held is None else held.run
 
 
 class MqttServer:

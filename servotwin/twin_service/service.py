@@ -129,7 +129,8 @@ class TwinService:
         if config.mqtt is not None:
             live = self.pages.live_intake
             handler = MqttRequestHandler(
-                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self._refusals
+                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self._refusals,
+                self.metrics.repeated,
             )  # fmt: skip
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []

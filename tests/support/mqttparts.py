@@ -92,8 +92,9 @@ class Twin:
         )
         self.views = LiveViews(self._loop.time, lambda _: None, 5, 5)
         live = LiveIntake(claims, self.views, self._loop.time)
+        refused = Refusals(self.metrics, self.wrong_tokens.append)
         handler = MqttRequestHandler(
-            gate, ingest, self.polls, claims, live, lambda: None, Refusals(self.metrics, self.wrong_tokens.append)
+            gate, ingest, self.polls, claims, live, lambda: None, refused, self.metrics.repeated
         )
         server = MqttServer(self._broker, handler, "twins")
         await server.start()

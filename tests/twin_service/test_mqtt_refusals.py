@@ -1,6 +1,7 @@
 """Refused requests over MQTT: who counts as their sender, and what holding an answer back must not hold up."""
 
 import asyncio
+from itertools import count
 from typing import Any
 
 import pytest
@@ -16,6 +17,8 @@ from servotwin.twin_service.limits import RateLimiter, RequestRejected
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.refusals import Refusals
+
+SERIALS = count()
 
 
 class Rejecting:
@@ -62,9 +65,8 @@ def server(metrics: Metrics) -> tuple[MqttServer, NotingConnection]:
     limiter = RateLimiter(1e6, 1e6, lambda: 0.0)
     gate = EdgeGate(AccessControl(VERIFIERS), lambda _: True, limiter, limiter)
     parts: Any = gate, Rejecting(), None, Unclaimed(), None, lambda: None
-    made = MqttServer(
-        Broker("mqtt://127.0.0.1"), MqttRequestHandler(*parts, Refusals(metrics, monotonic=lambda: 0.0)), "twins"
-    )
+    handler = MqttRequestHandler(*parts, Refusals(metrics, monotonic=lambda: 0.0), metrics.repeated)
+    made = MqttServer(Broker("mqtt://127.0.0.1"), handler, "twins")
     connection: Any = NotingConnection()
     made._connection = connection
     return made, connection
@@ -72,7 +74,7 @@ def server(metrics: Metrics) -> tuple[MqttServer, NotingConnection]:
 
 def request(servo: str, token: str) -> bytes:
     content = wire.PutRequest(b"no window")
-    return wire.encode_request(key_of(verifier_of(token)), servo, 1, content)
+    return wire.encode_request(key_of(verifier_of(token)), servo, next(SERIALS), content)
 
 
 async def settle() -> None:
