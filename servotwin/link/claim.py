@@ -147,11 +147,11 @@ class ExclusiveTransport:
                 raise Refused(Refusal.UNKNOWN_SCHEMA, str(error), error.after_s) from None
             raise
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:
         """Return the twin's messages; raises Refused (SUPERSEDED) where another edge has taken over."""
         self._confirm()
         try:
-            return self._transport.listen(after)
+            return self._transport.listen(after, at_once)
         except (Refused, Unreachable) as error:
             self._failed(error)
             raise

@@ -133,9 +133,9 @@ class HttpTransport:
             raise Unreachable("the answer to a window does not acknowledge it: whoever answers is not the twin")
         return _older_pause_s(response.headers.get(OLDER_PAUSE, ""))
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
-        path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
+        path = f"{self._base}/outgoing?after={after}&wait={0.0 if at_once else self._wait:g}"
         with self._down.in_step():
             response = self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES)
             return _decode_list(_checked(response, (200,)).body)

@@ -112,9 +112,10 @@ class MqttTransport:
             raise Unreachable("the answer to a message does not acknowledge it")
         return min(response.older_pause, LONGEST_OLDER_PAUSE_S)
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
-        response = self._request(PollRequest(after, self._wait, self.claim.text), self._wait)
+        wait = 0.0 if at_once else self._wait
+        response = self._request(PollRequest(after, wait, self.claim.text), wait)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages

@@ -334,9 +334,12 @@ class Receiver:
         self._backoff = Backoff(self.retry)
 
     def step(self) -> Received:
-        """Poll once; this blocks as long as the transport does."""
+        """Poll once; this blocks as long as the transport does.
+
+        After a trouble the twin answers at once: otherwise the trouble would seem to last until it has news.
+        """
         try:
-            received = self.transport.listen(self.after)
+            received = self.transport.listen(self.after, at_once=bool(self.trouble))
         except Unreachable as error:
             return self._pause("unreachable", str(error), 0.0)
         except Refused as error:

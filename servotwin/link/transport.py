@@ -79,10 +79,11 @@ class Transport(Protocol):
             It is not known whether the twin has it.
         """
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:
         """Return the twin's sealed messages with serials above `after`, in rising order; wait for the first one.
 
-        A message is returned again by each call until `after` has reached its serial.
+        With `at_once` it does not wait: the answer shows that the twin is there. A message is returned again by each
+        call until `after` has reached its serial.
 
         Raises
         ------

@@ -53,7 +53,7 @@ class Line:
         self.sent += 1
         return 0.0
 
-    def listen(self, _after: int) -> list[bytes]:
+    def listen(self, _after: int, at_once: bool = False) -> list[bytes]:  # noqa: ARG002
         self.twin.admit(self.claim)
         return []
 

@@ -45,6 +45,7 @@ class Script:
         self.faults: list[Exception | None] = []
         self.news: list[bytes] = []
         self.polls: list[int] = []
+        self.at_once: list[bool] = []
         self.pause_s = 0.0
 
     def deliver(self, parcel: Parcel) -> float:
@@ -52,8 +53,9 @@ class Script:
         self.delivered.append(parcel)
         return self.pause_s
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:
         self.polls.append(after)
+        self.at_once.append(at_once)
         self._fail()
         return self.news
 
@@ -355,6 +357,14 @@ def test_polls_that_fail_come_less_and_less_often(receiver: Receiver, script: Sc
     script.faults = [Unreachable("gone"), Refused(Refusal.BAD_TOKEN, "no"), Refused(Refusal.TOO_MANY, "slowly", 30.0)]
     assert [receiver.step().wait_s for _ in range(4)] == [1.0, 2.0, 30.0, 0.0]
     assert receiver.trouble == ""
+
+
+def test_after_a_trouble_the_twin_is_asked_to_answer_at_once(receiver: Receiver, script: Script) -> None:
+    """Otherwise the trouble would seem to last for as long as the twin has no news, up to 25 s."""
+    script.faults = [None, Unreachable("gone"), Refused(Refusal.TOO_MANY, "slowly")]
+    for _ in range(5):
+        receiver.step()
+    assert script.at_once == [False, False, True, True, False]
 
 
 @given(st.binary(max_size=300))

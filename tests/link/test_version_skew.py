@@ -37,7 +37,7 @@ class Script:
             raise self.faults.pop(0)
         return 0.0
 
-    def listen(self, after: int) -> list[bytes]:
+    def listen(self, after: int, at_once: bool = False) -> list[bytes]:  # noqa: ARG002
         self.polls.append(after)
         if self.listen_faults:
             raise self.listen_faults.pop(0)
