@@ -22,7 +22,7 @@ from servotwin.edge_process.link_child import LinkChild, link_command
 from servotwin.edge_process.monitoring import TroubleLog, log
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.shared_samples import SampleMemory
-from servotwin.edge_process.startup import check, exclusive, next_boot, permitted, stored_parameters
+from servotwin.edge_process.startup import check, exclusive, last_version, next_boot, permitted, stored_parameters
 from servotwin.edge_process.supervise import SupervisingRole
 from servotwin.errors import InvalidInput
 from servotwin.runtime.service_manager import ServiceManager
@@ -75,7 +75,8 @@ def run(path: str | os.PathLike[str]) -> None:
 
 
 def _run(config: EdgeConfig, path: Path, drive: Drive) -> None:
-    first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent, config.units)
+    stored = stored_parameters(config.path(config.files.parameters), last_version(config))
+    first = permitted(stored, config.agent, config.units)
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)

@@ -13,7 +13,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileParameterStore
 from servotwin.edge.supervisor import Rules
 from servotwin.edge_process.config import EdgeConfig, check_certificates, password_of, token_of
-from servotwin.edge_process.monitoring import log
+from servotwin.edge_process.monitoring import log, read_status
 from servotwin.errors import InvalidInput
 from servotwin.link.sqlite_file import check_kind
 from servotwin.runtime.extras import check_extra
@@ -119,10 +119,20 @@ def _count(path: Path) -> int:
     return int(text) if text.isdigit() and len(text) < 16 else 0
 
 
-def stored_parameters(path: Path) -> Parameters | None:
-    """Load the parameters of an earlier start; a file that holds none is renamed, so that the machine can run."""
+def stored_parameters(path: Path, version: int = 0) -> Parameters | None:
+    """Load the parameters of an earlier start; a file that holds none is renamed, so that the machine can run.
+
+    Parameters
+    ----------
+    path : path
+    version : int
+        In force by the last status; a missing file is said where it is not 0.
+    """
     try:
-        return FileParameterStore(path).load()
+        stored = FileParameterStore(path).load()
+        if stored is None and version > 0:
+            log("last parameters missing", version=version)
+        return stored
     except InvalidInput as error:
         log("last parameters not readable", error=str(error))
     except OSError as error:
@@ -133,6 +143,13 @@ def stored_parameters(path: Path) -> Parameters | None:
     except OSError as error:
         log("last parameters not put aside", error=str(error))
     return None
+
+
+def last_version(config: EdgeConfig) -> int:
+    """Version in force by this servo's last status; 0: the configured parameters, or not known."""
+    status = read_status(config.path(config.files.status)) or {}
+    version = status.get("version") if status.get("servo") == config.agent.servo else 0
+    return version if isinstance(version, int) else 0
 
 
 def permitted(stored: Parameters | None, agent: AgentSettings, units: OwnUnits = VOLTS_METRES) -> Parameters | None:

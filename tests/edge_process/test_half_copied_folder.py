@@ -16,8 +16,8 @@ from outbox_cases import window
 
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess
-from servotwin.edge_process.monitoring import read_status
-from servotwin.edge_process.startup import check, next_boot
+from servotwin.edge_process.monitoring import read_status, write_status
+from servotwin.edge_process.startup import check, last_version, next_boot, stored_parameters
 from servotwin.errors import InvalidInput
 from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import SqliteOutbox
@@ -199,6 +199,16 @@ def test_a_status_that_was_cut_tells_nothing_and_stops_nothing(folder: Path, sha
     with link(folder) as process:
         assert len(process.outbox.pending()) == WINDOWS
         assert process.outbox.dropped == {}
+
+
+@pytest.mark.parametrize(("servo", "version", "said"), [("axis-1", 5, 1), ("axis-1", 0, 0), ("axis-2", 5, 0)])
+def test_last_parameters_that_were_not_copied_are_said(
+    folder: Path, servo: str, version: int, said: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_status(folder / "status.json", {"servo": servo, "version": version})
+    config = load(folder / "edge.toml")
+    assert stored_parameters(folder / "parameters.json", last_version(config)) is None
+    assert capfd.readouterr().err.count(f'"event":"last parameters missing","version":{version}') == said
 
 
 def test_an_outbox_that_is_deleted_while_its_edge_runs_is_made_again_and_said(
