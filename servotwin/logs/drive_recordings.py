@@ -19,7 +19,7 @@ from servotwin.logs.cleaning import cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.log import read_columns
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
-from servotwin.logs.recordings import CUT, TIME_NAMES, check_one_log, numbers_of
+from servotwin.logs.recordings import CUT, TIME_NAMES, TURNED, check_left, check_one_log, is_newest_first, numbers_of
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
@@ -116,18 +116,22 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         )
     units = {part: _unit(path, part, chosen, wanted) for part in chosen}
     clock = LogClock(path, units.get("time", ""), wanted.rate)
-    time = clock.seconds(arrays.pop("time", None), sizes.pop())
+    size = sizes.pop()
+    time = clock.seconds(arrays.pop("time", None), size)
+    turned = is_newest_first(time)
+    if turned:
+        time, arrays = time[::-1], {part: values[::-1] for part, values in arrays.items()}
     turns = {part: 2.0 * math.pi / ANGLES[units[part]] for part in arrays if units[part] in ANGLES}
     try:
         clean = cleaned(time, arrays, turns)
     except InvalidInput as error:
         raise InvalidInput(f"log {path}: {error}") from None
     check_one_log(path, clean, clock)
-    if clean.time.size < _LEAST:
-        raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
+    check_left(path, clean, size, table.damaged, _LEAST)
     grid, usable, rate = _grid(clean.time)
     channels = {part: np.interp(grid, clean.time, values) for part, values in clean.channels.items()}
-    found = {**clean.found, **clock.found, **({CUT: 1} if table.ends_within_line else {})}
+    others = {CUT: int(table.ends_within_line), TURNED: size if turned else 0}
+    found = {**clean.found, **clock.found, **{defect: count for defect, count in others.items() if count}}
     # Between samples that lie off the grid there are values finer than a count.
     counts = {part: resolution(np.unique(values)) for part, values in clean.channels.items()}
     used = {part: name for part, name in chosen.items() if part != "time" or wanted.rate is None}

@@ -126,7 +126,7 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
             progress(gathering.samples)
     clean = gathering.cleaned()
     check_one_log(path, clean, clock)
-    _check_left(path, clean, gathering.samples, damaged)
+    check_left(path, clean, gathering.samples, damaged)
     thinned = THINNED in clean.found
     recording = EncoderRecording(
         time=clean.time,
@@ -165,8 +165,7 @@ def _tables(path: Path, chosen: Mapping[str, str], clock: LogClock, blocks: Iter
 def _oldest_first(tables: Iterator[_Table]) -> Iterator[_Table]:
     """The tables as they are, or all of them turned round where the newest sample comes first."""
     first = next(tables)
-    steps = np.diff(first.time[np.isfinite(first.time)])
-    if not (steps.size and np.mean(steps <= 0.0) > _BACKWARDS and np.any(steps < 0.0)):
+    if not is_newest_first(first.time):
         yield first
         yield from tables
         return
@@ -174,6 +173,12 @@ def _oldest_first(tables: Iterator[_Table]) -> Iterator[_Table]:
     channels = {name: np.concatenate([each.channels[name] for each in every])[::-1] for name in first.channels}
     damaged = {name: text for each in reversed(every) for name, text in each.damaged.items()}
     yield _Table(np.concatenate([each.time for each in every])[::-1], channels, damaged, every[-1].cut, True)
+
+
+def is_newest_first(time: Array) -> bool:
+    """True where nearly all times fall."""
+    steps = np.diff(time[np.isfinite(time)])
+    return bool(steps.size and np.mean(steps <= 0.0) > _BACKWARDS and np.any(steps < 0.0))
 
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
@@ -200,20 +205,26 @@ def check_one_log(path: Path, clean: Cleaned, clock: LogClock) -> None:
         raise InvalidInput(f"log {path}: {clock.set_back}: two logs in one file, or two machines; give each by itself")
 
 
-def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:
+def check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str], least: int = _LEAST) -> None:
+    """Refuse a log of `size` samples of which too few can be used, with the reasons.
+
+    Raises
+    ------
+    InvalidInput
+    """
     left = clean.time.size
     if size == 0:
         raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     if left == 1 and clean.found.get(SAME_TIME, 0) > _LEFT * size:
         raise InvalidInput(f"log {path}: its {size} samples have one time stamp: give --rate in Hz")
     whole = size - sum(clean.found.get(defect, 0) for defect in (THINNED, PARTED, REPEATED, BETWEEN))
-    if left >= max(_LEAST, _LEFT * whole):
+    if left >= max(least, _LEFT * whole):
         return
     what = "; ".join(f"{defect}: {count}" for defect, count in clean.found.items()) or "the log is short"
     first = next(iter(damaged.items()), None)
     where = f"; column {first[0]!r}, {first[1]}" if first else ""
     raise InvalidInput(
-        f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and {100.0 * _LEFT:.0f} % of all "
+        f"log {path}: {left} of {size} samples can be used, of at least {least} and {100.0 * _LEFT:.0f} % of all "
         f"({what}{where})"
     )
 

@@ -1,6 +1,7 @@
 """`servotwin commission`: an axis file from a log of command and position; one sentence for every invalid log."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -241,6 +242,7 @@ def test_a_motor_that_counts_against_its_load_is_turned(tmp_path):
     [
         (lambda r: r + 0.02 * np.random.default_rng(1).standard_normal(r.size), "explains the command"),
         (lambda r: 1.1 * r, "gains would be negative"),
+        (lambda r: 0.1 * r, "the reference moves 0.1007 times as far as the position: have both the same unit?"),
     ],
 )
 def test_a_controller_that_does_not_explain_the_log_is_not_written(tmp_path, change, says):
@@ -268,6 +270,37 @@ def test_a_rate_that_contradicts_the_times_of_the_log_is_told(log):
     assert "samples timed by --rate 1000 Hz, though the log's own times say 500 Hz: 3684" in told
     assert "time:" not in told.splitlines()[0]
     assert "--rate" not in run(log, "--rate", 500).output
+
+
+def rows_of(log):
+    head, *rows = log.read_text().splitlines()
+    return head, rows
+
+
+def test_a_log_with_the_newest_sample_first_is_turned_round(log, tmp_path):
+    head, rows = rows_of(log)
+    turned = tmp_path / "turned.csv"
+    turned.write_text("\n".join((head, *rows[::-1])) + "\n")
+    one, other = st.commission(log), st.commission(turned)
+    np.testing.assert_array_equal(other.best.values, one.best.values)
+    assert other.logs[0].found == {"samples of a log with the newest first, which was turned round": len(rows)}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: np.random.default_rng(0).permutation(rows), r"samples out of order in time: 3\d{3}"),
+        (lambda rows: [re.sub(",[^,]*", ",x", row, count=1) for row in rows], r"column 'motor \[mm\]', line 2: 'x'"),
+        (lambda _: [], "holds no row of numbers below the names of its columns"),
+    ],
+)
+def test_why_too_few_samples_can_be_used_is_said(log, tmp_path, change, says):
+    head, rows = rows_of(log)
+    bad = tmp_path / "bad.csv"
+    bad.write_text("\n".join((head, *change(rows))) + "\n")
+    result = run(bad)
+    assert result.exit_code == 2
+    assert re.search(says, result.stderr), result.stderr
 
 
 def test_counts_are_those_of_the_samples(tmp_path):

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
+
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
@@ -21,6 +23,8 @@ from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 GivenLaw = GivenGains | GivenPid
+# Of the ways of reference and position: a loop that follows is within.
+_SAME_WAY = 1.2
 _FITTED, _FITTED_PID = GivenGains(), GivenPid()
 # Of the force: the PID that ran left a thousandth, one fitted to a cascade's log a fifth.
 _PID_LEAVES = 0.05
@@ -227,7 +231,7 @@ def _law(recording: DriveRecording, gains: GivenLaw) -> tuple[FittedLaw | None, 
     if law.explains:
         return law, ()
     checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
-    return (law if gains.complete else None), (_unexplained(law, gains),)
+    return (law if gains.complete else None), (_unexplained(law, gains) + _other_way(recording),)
 
 
 def _with_its_law(found: Refinement, first: tuple[ParameterFit, ParameterFit], rate: float) -> Refinement:
@@ -269,3 +273,12 @@ def _unexplained(law: FittedLaw, gains: GivenLaw) -> str:
     return (
         f"{said} (its gains would be negative): is the reference late, or in another unit or scale than the position?"
     )
+
+
+def _other_way(recording: DriveRecording) -> str:
+    """Say where the reference moves much further than the position, or much less."""
+    assert recording.reference is not None
+    moved = float(np.ptp(recording.reference) / np.ptp(recording.position))
+    if 1.0 / _SAME_WAY < moved < _SAME_WAY:
+        return ""
+    return f"; the reference moves {moved:.4g} times as far as the position: have both the same unit?"
