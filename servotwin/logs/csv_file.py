@@ -22,7 +22,9 @@ _SAMPLE = 65536  # bytes from which the encoding is guessed
 _LOOKED_AT = 40  # lines from which the layout is guessed
 _METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
 _COMMENTS = ("#", "%", "//")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?$")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?$")
+_THOUSANDS_OR_DECIMALS = re.compile(r"[+-]?[1-9]\d{0,2}(\.\d{3})+$")
+_POINT = re.compile(r"[+-]?\d*\.\d*(e[+-]?\d+)?$", re.IGNORECASE)
 _COMMA = re.compile(r"(^|[^\d.,])[+-]?(\d+|\d{1,3}(\.\d{3})+),\d+($|[^\d.,])")
 _LONGEST_CELL = 2**31 - 1
 """Characters: the metadata of a log, with its scenario, are one cell; Python's own limit is 131072."""
@@ -94,7 +96,9 @@ def csv_blocks(path: Path, requested: Requested) -> Iterator[LogColumns]:
                 "are in one file: give each its own name"
             )
         places = [layout.names.index(name) for name in wanted]
+        unclear = set(places) if layout.decimal_comma else set()
         for number, lines in _blocks(file, layout.first + 1):
+            _check_points(path, layout, unclear, lines, number)
             values, damaged = _values(lines, layout, places, number)
             texts = {wanted[place]: text for place, text in damaged.items()}
             cut = bool(lines) and not lines[-1].endswith("\n")
@@ -111,7 +115,7 @@ def _layout(path: Path) -> _Layout:
         raise InvalidInput(f"log {path}: line 1 must name the columns; the file holds no row")
     separator = _separator([line for _, line in kept[1:_LOOKED_AT]] or [kept[0][1]])
     rows = [_cells(line, separator) for _, line in kept]
-    comma = any(_decimal_comma(cell, separator) for cells in rows[1:_LOOKED_AT] for cell in cells)
+    comma = _decimal_comma([cell for cells in rows[1:_LOOKED_AT] for cell in cells], separator)
     size = _usual_size(rows[1:_LOOKED_AT] or rows)
     first = next((i for i, cells in enumerate(rows) if _numeric(cells[:size], comma)), len(rows))
     # Above the names there may be prose.
@@ -138,9 +142,14 @@ def _filled(cells: Sequence[str]) -> int:
     return max((place for place, cell in enumerate(cells, 1) if cell), default=0)
 
 
-def _decimal_comma(cell: str, separator: str | None) -> bool:
-    """True for a cell with a decimal comma; between commas it stands in quotes, where thousands may stand as well."""
-    return _COMMA.match(cell) is not None and (separator != "," or _THOUSANDS.match(cell) is None)
+def _decimal_comma(cells: Sequence[str], separator: str | None) -> bool:
+    """True where numbers have decimal commas: not where all commas may part thousands, and points part decimals or
+    commas part columns."""
+    commas = [cell for cell in cells if _COMMA.match(cell)]
+    if any(not _THOUSANDS.match(cell) for cell in commas):
+        return True
+    points = any(_POINT.match(cell) and not _THOUSANDS_OR_DECIMALS.match(cell) for cell in cells)
+    return bool(commas) and separator != "," and not points
 
 
 def _no_numbers(path: Path, kept: Sequence[tuple[int, str]], rows: Sequence[Sequence[str]], size: int) -> str:
@@ -261,6 +270,27 @@ def _blocks(file: IO[str], line_number: int) -> Iterator[tuple[int, list[str]]]:
         lines = list(islice(file, _ROWS))
         if lines:
             yield line_number, lines
+
+
+def _check_points(path: Path, layout: _Layout, unclear: set[int], lines: Sequence[str], line_number: int) -> None:
+    """Refuse a column in which every point may part thousands, among decimal commas; those with another are taken from
+    the `unclear` ones."""
+    doubtful: dict[int, str] = {}
+    rows = [(number, line) for number, line in enumerate(lines, line_number) if "." in line] if unclear else []
+    for number, line in rows:
+        cells = _cells(line, layout.separator)
+        for place in unclear & set(range(len(cells))):
+            if _THOUSANDS_OR_DECIMALS.match(cells[place]):
+                doubtful.setdefault(place, f"line {number}: column {layout.names[place]!r}, {cells[place]!r}")
+            elif "." in cells[place]:
+                unclear.discard(place)
+        if not unclear:
+            return
+    for place in sorted(unclear & doubtful.keys()):
+        raise InvalidInput(
+            f"log {path}: {doubtful[place]}: the point may part thousands or decimals: the other numbers have decimal "
+            "commas; write this column without thousands separators"
+        )
 
 
 def _patiently(

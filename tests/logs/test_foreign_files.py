@@ -79,6 +79,46 @@ def test_quoted_decimal_commas_between_commas_are_read(tmp_path, made):
     assert np.allclose(read_recording(tmp_path / "a.csv", RecordingColumns()).recording.load, made.load, atol=1e-8)
 
 
+def texts(path, made, separator, time, load):
+    """A table whose times (s) and loads (um, far from 0) are written as the two functions do."""
+    cells = [(time(t), f"{m:.6f}", load(x)) for t, m, x in zip(made.time, made.motor, micrometres(made), strict=True)]
+    path.write_text("\n".join(separator.join(row) for row in [("time", "motor [rad]", "load [um]"), *cells]) + "\n")
+    return path
+
+
+def micrometres(made):
+    return np.round(2e4 + 1e4 * made.load)
+
+
+def test_quoted_decimal_commas_of_three_digits_are_no_thousands(tmp_path, made):
+    path = texts(tmp_path / "a.csv", made, ",", lambda t: f'"{t:.3f}"'.replace(".", ","), lambda x: f"{x:.0f}")
+    assert np.allclose(read_recording(path, RecordingColumns()).recording.time, made.time, atol=1e-3)
+
+
+def test_thousands_between_tabs_are_no_decimal_commas(tmp_path, made):
+    path = texts(tmp_path / "a.txt", made, "\t", lambda t: f"{t:.4f}", lambda x: f"{x:,.0f}")
+    assert np.allclose(read_recording(path, RecordingColumns()).recording.load, micrometres(made))
+
+
+def test_points_that_may_part_thousands_or_decimals_are_refused(tmp_path, made):
+    said = refused(
+        texts(
+            tmp_path / "a.csv",
+            made,
+            ";",
+            lambda t: f"{t:.4f}".replace(".", ","),
+            lambda x: f"{x:,.0f}".replace(",", "."),
+        )
+    )
+    assert "line 2: column 'load [um]', '" in said
+    assert "thousands or decimals: the other numbers have decimal commas; write this column without thousands" in said
+
+
+def test_a_column_with_decimal_points_beside_decimal_commas_is_read(tmp_path, made):
+    path = texts(tmp_path / "a.csv", made, ";", lambda t: f"{t:.4f}".replace(".", ","), lambda x: f"{x:.1f}")
+    assert np.allclose(read_recording(path, RecordingColumns()).recording.load, micrometres(made))
+
+
 def test_two_logs_in_one_file_are_refused_where_the_clock_goes_back(tmp_path, made):
     one = np.column_stack([made.time, made.motor, made.load])
     path = table(tmp_path / "two.csv", made, one, one * [1.0, 1.1, 2.0])
