@@ -130,7 +130,8 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
 def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(fallback, "ways_out", lambda *_: "another way out")
     reason = r"no fallback set for the servo's stated range: none of \d+ candidates "
-    ranges = "steps of 0.1 to 2.5 mm from rest, gaps of 0 to 60 deg, input bias of -0.1 to 0.1 V, friction of 0 to 0"
+    ranges = "steps of 0.1 to 2.5 mm from rest, gaps of 0 to 60 deg at the motor, input bias of "
+    ranges += "-0.1 to 0.1 V, friction of 0 to 0"
     words = rf"{reason}.* by default are {ranges} N m; another way out; "
     words += r"without a twin it can be simulated: enabled = false in \[twin\], and no policy$"
     with pytest.raises(InvalidInput, match=words):

@@ -169,6 +169,8 @@ def test_the_certificate_says_what_was_tried_and_what_leaving_out_integral_actio
     assert found.error_per_volt == pytest.approx(1.0 / law.Kp)
     assert "verified on 16 simulated machines in continuous time: steps of" in found.tried(SERVO)
     assert " mm from rest" in found.tried(SERVO)
+    assert " deg at the motor, input bias of " in found.tried(SERVO)
+    assert found.tried(SERVO).count("; not tried: measurement noise, a gap that grows while the loop moves, ") == 1
     turning = found.tried(Axis.preset("robot-joint"))
     assert " deg from rest" in turning
     assert " N m, friction" in turning

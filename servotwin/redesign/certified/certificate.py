@@ -9,6 +9,11 @@ from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import in_words
 from servotwin.redesign.design import Design, with_feedforward
 
+_NOT_TRIED = (
+    "measurement noise, a gap that grows while the loop moves, compliance other than the model's, several axes, a "
+    "sensor or drive that fails"
+)
+
 
 @dataclass(frozen=True)
 class LoopMargins:
@@ -217,7 +222,7 @@ class Certificate:
         return replace(self, setting=setting, input_bias=(low - feedforward, high - feedforward), effort=effort)
 
     def tried(self, servo: Plant) -> str:
-        """Sentence on what was tried, with ranges in the units of the servo or axis that was verified."""
+        """Sentence on what was tried and what was not, with ranges in the units of the servo or axis."""
         law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, up to {self.delay} samples late"
         text = (
             f"verified on {self.members} simulated machines {law}: {in_words(self, servo)}; "
@@ -241,7 +246,7 @@ class Certificate:
             )
             text += f", up to {extra.delay} samples late" if self.rate else ""
             text += f", of which {100.0 * extra.settled:.4g} % come to rest" if extra.settled < 1.0 else ""
-        return text
+        return f"{text}; not tried: {_NOT_TRIED}"
 
 
 @dataclass(frozen=True)

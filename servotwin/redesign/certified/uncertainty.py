@@ -87,7 +87,7 @@ def in_words(ranges: StatedRanges, plant: Plant) -> str:
     low, high = (math.degrees(end) for end in ranges.gap)
     return (
         f"steps of {unit.factor * ranges.step[0]:.3g} to {unit.factor * ranges.step[1]:.3g} {unit.name} from rest, "
-        f"gaps of {low:.4g} to {high:.4g} deg, input bias of {ranges.input_bias[0]:.3g} to "
+        f"gaps of {low:.4g} to {high:.4g} deg at the motor, input bias of {ranges.input_bias[0]:.3g} to "
         f"{ranges.input_bias[1]:.3g} {command}, friction of {ranges.friction[0]:.3g} to {ranges.friction[1]:.3g} N m"
     )
 
