@@ -252,9 +252,18 @@ def with_notch(servo: Plant) -> Controller | Cascade | None:
     if rate is not None and hertz > _RESOLVED * rate:
         return None
     # Rounded: what a window adds to a learnt resonance is not worth another notch.
-    hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
+    unit = _unit_hz(own)
+    hertz = unit * 2.0 ** (round(_PER_OCTAVE * math.log2(hertz / unit)) / _PER_OCTAVE)
     depth = min(0.9, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
     return own.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
+
+
+def _unit_hz(law: Controller | Cascade) -> float:
+    """Frequency of the law, whatever is learnt: 1 Hz at a rate of 1 kHz, or of the paper's law in continuous time."""
+    if law.sample_rate is not None:
+        return 1e-3 * law.sample_rate
+    assert isinstance(law, Controller)
+    return 0.5 / law.release if law.release > 0.0 else 1.0
 
 
 def own_static_gain(servo: Plant) -> float:
