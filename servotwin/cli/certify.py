@@ -220,5 +220,6 @@ def _summary(job: _TableJob, table: CertifiedTable) -> str:
     others = "; in the others the twin sends the fallback set" if shares[False] else ""
     return (
         f"written: {job.path}: {shares[True]} of {len(table.cells)} cells of gaps from {low:g} to {high:g} deg are"
-        f" verified, with {len(different)} different setting{'s' * (len(different) != 1)}{others}"
+        f" verified, with {len(different)} different setting{'s' * (len(different) != 1)}{others}\n"
+        f"fallback set, for all of them: {table.fallback.tried(job.policy.servo)}"
     )

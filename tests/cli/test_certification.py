@@ -51,6 +51,8 @@ def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path:
     console = quiet()
     (table,) = certify(path, grid=COARSE, console=console)
     assert "1 of 1 cells of gaps from 0 to 60 deg are verified" in console.file.getvalue()
+    assert "fallback set, for all of them: verified on 300 simulated machines" in console.file.getvalue()
+    assert "; not tried: measurement noise" in console.file.getvalue()
     assert len(table.cells) == 1
     assert ModelRegistry.loads(path.read_text(), "twin.toml", tmp_path).models[0].settings.table == str(
         tmp_path / "one.table"
