@@ -268,6 +268,12 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
             lines.append("the motor's encoder counts in the opposite direction of the load's: its sign was changed")
     if shaft is None:
         return lines
+    if math.isnan(shaft.delay):
+        return [
+            *lines,
+            f"shaft: taken as rigid: the encoders are coherent up to {shaft.highest:.3g} Hz, and the load follows the "
+            "motor neither at once nor as one mass on a shaft does",
+        ]
     delay = f"{1e3 * shaft.delay:.3g} ± {1e3 * NORMAL_95 * shaft.delay_std:.2g} ms (95 %)"
     late = f"the load's encoder is {delay} late"
     if not math.isfinite(shaft.resonance):

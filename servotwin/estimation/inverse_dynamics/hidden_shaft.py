@@ -1,4 +1,4 @@
-"""An elasticity behind the only encoder: the load's acceleration lags, and the motor's alone gives a wrong inertia."""
+"""An elasticity behind the motor's encoder: the load's acceleration lags, and the motor's alone gives a wrong inertia."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ class HiddenShaft:
         """The parameters of the models without a shaft."""
         return self.symmetric.only(SYMMETRIC), self.asymmetric.only(ASYMMETRIC)
 
-    def __str__(self) -> str:
+    def remark(self, load_encoder: bool) -> str:
         """One sentence; empty: not for sure."""
         if not self.sure:
             return ""
-        return (
+        text = (
             f"the command fits a machine with an elasticity better than a rigid one: a resonance of about "
             f"{self.resonance:.2g} Hz with the motor held, which the axis does not have; "
-            "the intervals contain what it does to the parameters; "
-            "record a second encoder at the load"
+            "the intervals contain what it does to the parameters"
         )
+        return text if load_encoder else f"{text}; record a second encoder at the load"
 
 
 def hidden_shaft(

@@ -60,7 +60,7 @@ class IdentifiedDrive:
     late : str
         By how much the command moves the drive at another time than it was logged; empty: it does not for sure.
     elastic : str
-        Elasticity that the only encoder shows; empty: none for sure.
+        Elasticity that the motor's encoder shows and the axis does not have; empty: none for sure.
     """
 
     symmetric: ParameterFit
@@ -126,7 +126,7 @@ def identify_drive(
         found = loop.refined((widened(fits[0], others[0]), widened(fits[1], others[1])), 0.0)
     # No further motion shows more of what the hold does.
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
-    hidden = None if used[0].load is not None else hidden_shaft(used, motions, bands, late)
+    hidden = hidden_shaft(used, motions, bands, late)
     found = found.with_shaft(hidden, late)
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
@@ -141,7 +141,7 @@ def identify_drive(
         shaft,
         split,
         words,
-        str(hidden or ""),
+        "" if hidden is None or split is not None else hidden.remark(used[0].load is not None),
     )
 
 
@@ -176,7 +176,7 @@ class _Fits:
         return self.refinement.lag if self.refinement is not None and self.refinement.converged else None
 
     def with_shaft(self, hidden: HiddenShaft | None, late: CommandDelay) -> _Fits:
-        """These, their intervals with what a shaft behind the only encoder does."""
+        """These, their intervals with what a shaft behind the motor's encoder does."""
         if hidden is None:
             return self
         symmetric, asymmetric = hidden.rigid

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize, signal
 
+from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, least_squares, rows_of
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
@@ -25,6 +26,7 @@ _SEGMENTS = 16  # half overlapping, of the average
 _LEAST = 8  # frequencies
 _LEAKAGE = 0.02  # of the response: what the segments' window smears
 _BEYOND = 1.5  # of the resonance: corner of the filter that shows both inertias
+_NO_PEAK = math.sqrt(0.5)  # damping ratio from which on a response has no peak
 _EVIDENT = 4.0  # standard deviations by which the compliance must differ from none
 
 
@@ -44,7 +46,7 @@ class ShaftResponse:
     damping, damping_std : float
         Ratio.
     delay, delay_std : float
-        s, by which the load's encoder is later than the motor's.
+        s, by which the load's encoder is later than the motor's; NaN: the load follows the motor in another way.
     """
 
     frequency: Array
@@ -120,12 +122,14 @@ def _fitted(frequency: Array, response: Array, spread: Array) -> tuple[float, fl
     if compliance < max(_EVIDENT * deviations[0], 1.0):
         return math.inf, math.inf, math.nan, math.inf, delay, delay_std
     omega = top / math.sqrt(compliance)
-    zeta = 0.5 * loss * omega / top
+    zeta, zeta_std = 0.5 * loss * omega / top, 0.5 * omega / top * float(deviations[1])
+    if not -NORMAL_95 * zeta_std < zeta < _NO_PEAK:  # three masses, or a belt that slips
+        return math.inf, math.inf, math.nan, math.inf, math.nan, math.inf
     return (
         omega / (2.0 * math.pi),
         0.5 * omega / (2.0 * math.pi) * float(deviations[0]) / compliance,
-        float(zeta),
-        0.5 * omega / top * float(deviations[1]),
+        max(float(zeta), 0.0),
+        zeta_std,
         delay,
         delay_std,
     )
