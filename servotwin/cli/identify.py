@@ -13,8 +13,9 @@ import numpy as np
 from servotwin.cli.gap_options import GapForm, stated_gap
 from servotwin.cli.log_controller import controller_remarks
 from servotwin.errors import InvalidInput
+from servotwin.estimation import motor_side
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.estimation.gap import is_motors_position
+from servotwin.estimation.gap import default_method, is_motors_position, settings_of
 from servotwin.estimation.late_window import samples_late
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.learning.wear import Wear
@@ -105,9 +106,9 @@ def identify(options: IdentifyOptions, progress: Report = _silent) -> Identifica
     """
     log = read_log(options.log)
     servo = _servo(options, log)
-    stated = _settings(options, servo)
-    settings, windows = stated.on(servo), cut(log, options, servo)
     seen = _with_seen_load(servo, log.whole)
+    stated = _settings(options, servo, _known_of_gap(seen))
+    settings, windows = stated.on(servo), cut(log, options, servo)
     if isinstance(servo, Axis) and options.wear_over_s is None:
         followed = _followed_without_wear(log, windows, seen, settings, progress)
     else:
@@ -151,16 +152,28 @@ def _followed_without_wear(
 
     The wear decides which windows are accepted, and these show the wear: they are estimated again until both agree.
     """
-    over, growth = log.whole.duration, 0.0
+    over, growth, known = log.whole.duration, 0.0, _known_of_gap(seen)
     share = min(1.0, over / (_WEAR * windows[0].duration))
-    trend = TrendSettings(rate_std_rad_per_s=0.0)
+    trend = TrendSettings(rate_std_rad_per_s=0.0, rate_walk_rad_per_s_per_sqrt_s=0.0, **known)
     while True:
         followed = _followed(windows, seen, replace(settings, trend=trend), progress)
         shown = _growth([estimate for estimate in followed.estimates if estimate.ok], share)
         if shown <= 2.0 * growth:
             return followed
         growth = shown
-        trend = TrendSettings.for_wear(growth, over)
+        trend = TrendSettings.for_wear(growth, over, **known)
+
+
+def _known_of_gap(seen: Plant) -> dict[str, Any]:
+    """What is known of an axis's gap before its windows, and of the error that they share: no angle of another machine.
+
+    Empty where the estimator itself counts its error as an angle, as that of a servo does.
+    """
+    method = motor_side.METHOD if seen.at_motor else default_method(seen)
+    share = getattr(settings_of(method), "model_share", None)
+    if share is None:
+        return {}
+    return {"gap_std_rad": seen.largest_gap, "shared_error_rad": 0.0, "shared_error_share": share}
 
 
 def _growth(estimates: Sequence[GapEstimate], share: float) -> float:
@@ -258,14 +271,15 @@ def _with_seen_load(servo: Plant, whole: Window) -> Plant:
     return servo.replace(sensors=replace(servo.sensors, feedback=LOAD))
 
 
-def _settings(options: IdentifyOptions, servo: Plant) -> TwinSettings:
+def _settings(options: IdentifyOptions, servo: Plant, known: Mapping[str, float]) -> TwinSettings:
     machine = options.servo or str(options.log)
     form, wear = stated_gap("wear", options.wear_deg, options.at_load, machine, servo)
     over = options.wear_over_s
     if (wear is None) != (over is None):
         raise InvalidInput(f"{form.option} and --wear-over-s belong together: give both, or neither")
-    known = wear is not None and over is not None
-    trend = TrendSettings.for_wear(form.at_motor(wear), over) if known else TrendSettings()  # type: ignore[arg-type]
+    trend = TrendSettings()
+    if wear is not None and over is not None:
+        trend = TrendSettings.for_wear(form.at_motor(wear), over, **known)
     form, limit = stated_limit(options, servo)
     if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
         raise InvalidInput(f"{form.option} {limit!r}: must be a finite number of at least 0")

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scaling import AxisUnits, scaled_axis
 from typer.testing import CliRunner
 from worm_table import WORM_TABLE
 
 import servotwin as st
 from servotwin.cli.app import app
-from servotwin.cli.identify import IdentifyOptions, identify
+from servotwin.cli.identify import Identification, IdentifyOptions, identify
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import read_log, write_log
@@ -61,6 +62,42 @@ def test_the_wear_of_an_axis_is_that_of_its_gap_and_log(logs: Path) -> None:
         assert own.ok
         assert own.interval[0] <= GAP <= own.interval[1]
         assert np.ptp(own.interval) < 0.8 * np.ptp(fast.interval)
+
+
+@pytest.fixture(scope="module")
+def own_report(logs: Path) -> Identification:
+    return identify(IdentifyOptions(logs / "own.npz", window=1.9, gap_limit_deg=2.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("time", "angle"), [(0.1, 1.0), (10.0, 1.0), (1.0, 1e-3), (1.0, 10.0), (10.0, 1e-3)])
+def test_a_log_in_other_times_and_angles_has_the_same_gaps_and_trend(
+    logs: Path, own_report: Identification, tmp_path: Path, time: float, angle: float
+) -> None:
+    """The same motion, slower or faster, in a gap and with encoders that are finer or coarser."""
+    axis = scaled_axis(DRIVE, AxisUnits(time=time))
+    sensors, law = axis.sensors, axis.controller
+    counts, finer = sensors.encoder_resolution, sensors.position_resolution
+    axis = axis.replace(
+        sensors=replace(sensors, encoder_resolution=angle * counts, position_resolution=angle * finer),
+        controller=replace(law, voltage_limit=angle * law.voltage_limit),
+    )
+    columns = read_log(logs / "own.npz").table().columns
+    table = {name: (time if name == "time_s" else angle) * values for name, values in columns.items()}
+    write_log(SignalTable(table, {"servo": axis.dumps()}), tmp_path / "log.npz")
+    found = identify(IdentifyOptions(tmp_path / "log.npz", window=1.9 * time, gap_limit_deg=2.0 * angle))
+    assert [each.status for each in found.estimates] == [each.status for each in own_report.estimates]
+    assert [len(each) for each in found.remarks] == [len(each) for each in own_report.remarks]
+    now, then = (np.array([each.interval for each in report.estimates]) for report in (found, own_report))
+    assert now / angle == pytest.approx(then, rel=1e-3)
+    mine, known, pace = found.trend, own_report.trend, angle / time
+    assert mine is not None
+    assert known is not None
+    assert np.array(mine.gap_interval) / angle == pytest.approx(known.gap_interval, rel=1e-3)
+    assert np.array(mine.rate_interval) / pace == pytest.approx(known.rate_interval, rel=1e-3)
+    assert found.until_limit is not None
+    assert own_report.until_limit is not None
+    assert found.until_limit.interval[0] / time == pytest.approx(own_report.until_limit.interval[0], rel=1e-3)
 
 
 @pytest.mark.slow

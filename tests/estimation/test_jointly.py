@@ -10,7 +10,7 @@ from exploration import explored
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.joint.estimator import JointSettings, estimate_jointly
-from servotwin.estimation.learning.trend import Trend
+from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
@@ -183,7 +183,7 @@ def test_random_windows_are_right_or_refused():
 def test_a_prior_counts_and_starts():
     run = run_of("paper", 10.0, False, False)
     window = windows(run)[0]
-    trend = Trend.start(0.0)
+    trend = Trend.start(0.0, TrendSettings())
     for time in (0.0, 2.0, 4.0):
         trend = trend.update(GapEstimate(math.radians(10.0), 1e-4, 4e-4, (0.17, 0.18), GapStatus.OK, time))
     ahead = trend.predict(5.5)

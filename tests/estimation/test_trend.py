@@ -165,7 +165,7 @@ def test_the_time_to_a_limit_covers_when_wear_reaches_it():
 
 def test_follows_the_papers_wear():
     """0 to 20 deg as an S-curve over 200 s, a window every 20 s good to 0.02 deg: predictions 20 s ahead."""
-    rng, trend = np.random.default_rng(2), Trend.start(0.0)
+    rng, trend = np.random.default_rng(2), Trend.start(0.0, TrendSettings())
     scores = []
     for time in np.arange(0.5, 200.0, 20.0):
         u = time / 200.0
@@ -334,10 +334,10 @@ def test_a_prior_for_the_next_window():
         lambda: TrendSettings(outlier_std=math.nan),
         lambda: TrendSettings(restart_after=0),
         lambda: TrendSettings.for_wear(0.0, 1.0),
-        lambda: Trend.start(math.inf),
-        lambda: Trend.start(1.0).predict(0.0),
-        lambda: Trend.start(0.0).time_until(-1.0),
-        lambda: Trend.start(0.0).update(seen(0.0, 0.1, 0.01), OffsetReading(0.0, 0.01, 1.0)),
+        lambda: Trend.start(math.inf, TrendSettings()),
+        lambda: Trend.start(1.0, TrendSettings()).predict(0.0),
+        lambda: Trend.start(0.0, TrendSettings()).time_until(-1.0),
+        lambda: Trend.start(0.0, TrendSettings()).update(seen(0.0, 0.1, 0.01), OffsetReading(0.0, 0.01, 1.0)),
     ],
 )
 def test_nonsense_is_refused(wrong):
@@ -349,7 +349,7 @@ def test_nonsense_is_refused(wrong):
 def test_a_first_gap_of_several_turns_of_the_motor_counts(share: float) -> None:
     """The prior's 60 degrees are nobody's statement: a gap behind a gear of a hundred turns is no outlier."""
     gap = 826.0 * DEG
-    found = Trend.start(0.0).update(seen(1.0, gap, share * gap))
+    found = Trend.start(0.0, TrendSettings()).update(seen(1.0, gap, share * gap))
     assert (found.updates, found.refused) == (1, 0)
     assert found.gap == pytest.approx(gap, rel=0.03)
     assert found.gap_interval[0] < gap < found.gap_interval[1]
@@ -357,7 +357,7 @@ def test_a_first_gap_of_several_turns_of_the_motor_counts(share: float) -> None:
 
 def test_a_jump_to_several_turns_of_the_motor_starts_the_trend_afresh_there() -> None:
     gap = 826.0 * DEG
-    found = Trend.start(0.0).update(seen(1.0, 10.0 * DEG, 0.1 * DEG))
+    found = Trend.start(0.0, TrendSettings()).update(seen(1.0, 10.0 * DEG, 0.1 * DEG))
     for time in (2.0, 3.0):
         found = found.update(seen(time, gap, 0.15 * gap))
     assert found.afresh

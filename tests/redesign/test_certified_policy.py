@@ -12,7 +12,7 @@ from msgspec import structs
 from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.learning.trend import Trend
+from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
@@ -93,7 +93,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
 
 def test_where_the_gap_may_only_grow_beyond_the_range_the_fallback_set_is_sent(policy: CertifiedPolicy) -> None:
     """What is in force was verified for the gap of before."""
-    trend = Trend.start()
+    trend = Trend.start(0.0, TrendSettings())
     for time in range(6):
         trend = trend.update(replace(estimated(40.0 + 1.5 * time), time=10.0 * time))
     last = replace(estimated(47.5), time=50.0)
@@ -127,7 +127,7 @@ def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(polic
 def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: CertifiedPolicy) -> None:
     refused = estimated(3.0, status=GapStatus.UNIDENTIFIABLE)
     assert policy.redesign(Evidence(refused, at_rest(0.05))).setting is None
-    trend = Trend.start(0.0).update(estimated(10.0))
+    trend = Trend.start(0.0, TrendSettings()).update(estimated(10.0))
     made = policy.redesign(Evidence(refused, at_rest(0.05), trend, rests=(0.05, 0.05)))
     assert made.setting is not None
     assert made.setting.gains.feedforward == -0.05
@@ -171,7 +171,7 @@ def test_rests_that_differ_indicate_friction_and_the_bias_between_them(policy: C
 @pytest.mark.parametrize("horizon", [20.0, 200.0])
 def test_wear_until_the_horizon_widens_the_range_of_gaps(horizon: float) -> None:
     """A setting is to hold until the horizon, while the gap grows at the fastest rate that the trend allows."""
-    trend = Trend.start()
+    trend = Trend.start(0.0, TrendSettings())
     for time in range(6):
         trend = trend.update(replace(estimated(4.0 + 0.01 * time), time=10.0 * time))
     assert trend.rate_interval[1] > 0.0

@@ -9,6 +9,7 @@ import pytest
 import servotwin as st
 from servotwin.control.controller import ControllerChanges
 from servotwin.errors import InvalidInput
+from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.plant.changes import ServoChanges
 from servotwin.simulation.ensemble import Cases, simulate_members
 
@@ -63,7 +64,7 @@ def test_a_gap_of_a_whole_turn_is_accepted(servo):
 def test_reprs_fit_on_few_lines(servo, run):
     window = st.Window.from_run(run, 0.5, 1.0)
     estimate = st.estimate_gap(window, servo)
-    trend = st.Trend.start().update(estimate)
+    trend = st.Trend.start(0.0, TrendSettings()).update(estimate)
     scenario = st.Scenario(servo, 10.0)
     for value in (servo, servo.controller, run, window, estimate, trend, scenario):
         assert len(repr(value)) < 400, repr(value)

@@ -84,6 +84,16 @@ _DIMENSIONS: Mapping[str, tuple[int, int, int, int]] = {
     "voltage_limit_v": (0, 0, 0, 1),
     "sample_rate_hz": (-1, 0, 0, 0),
     "velocity_time_s": (1, 0, 0, 0),
+    "stiffness_n_m_per_rad": (0, 0, 1, 0),
+    "damping_n_m_s_per_rad": (1, 0, 1, 0),
+    "position_gain_per_s": (-1, 0, 0, 0),
+    "velocity_gain_n_m_s_per_rad": (1, 0, 1, 0),
+    "integral_time_s": (1, 0, 0, 0),
+    "speed_filter_s": (1, 0, 0, 0),
+    "reference_filter_s": (1, 0, 0, 0),
+    "position_resolution_rad": (0, 0, 0, 0),
+    "travel_rad_per_rad": (0, 0, 0, 0),
+    "ratio": (0, 0, 0, 0),
 } | dict.fromkeys(_PLAIN, (0, 0, 0, 0))
 
 
@@ -97,7 +107,7 @@ class AxisUnits(NamedTuple):
 
 
 def scaled_axis(axis: Axis, units: AxisUnits) -> Axis:
-    """The same linear axis in other units; its release time is the default in those."""
+    """The same axis in other units; its release time is the default in those, and a rotary load has no length."""
     return Axis.loads(dumps(_scaled_table(tomllib.loads(axis.dumps()), units)), "scaled.toml")
 
 

@@ -165,11 +165,13 @@ class Trend:
         return html_table("Trend", rows | ({"last window": "; ".join(self.reasons)} if self.reasons else {}))
 
     @classmethod
-    def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:
-        """Return the state before the first window: zero, as uncertain as the settings say."""
-        given = settings or TrendSettings()
-        spread = np.array([given.gap_std_rad, given.rate_std_rad_per_s, given.offset_std_rad])
-        return cls(_time(time), np.zeros(3), np.diag(spread**2), given)
+    def start(cls, time: float, settings: TrendSettings) -> Trend:
+        """Return the state before the first window: zero, as uncertain as the settings say.
+
+        Their defaults are those of the paper's servo: `TrendSettings.on` has them for another one.
+        """
+        spread = np.array([settings.gap_std_rad, settings.rate_std_rad_per_s, settings.offset_std_rad])
+        return cls(_time(time), np.zeros(3), np.diag(spread**2), settings)
 
     def predict(self, time: float) -> Trend:
         """The state at a later time, s; a gap that would shrink below zero has closed, and stays so.
@@ -312,7 +314,7 @@ class Trend:
     @property
     def gap_std(self) -> float:
         """Standard deviation of the gap, the error shared by all windows included, rad."""
-        return math.hypot(math.sqrt(self.covariance[GAP, GAP]), self.settings.shared_error_rad)
+        return math.hypot(math.sqrt(self.covariance[GAP, GAP]), self.settings.shared_error(self.gap))
 
     @property
     def gap_interval(self) -> Interval:
@@ -356,7 +358,7 @@ class Trend:
         if not 0.0 <= gap < math.inf:
             raise InvalidInput(f"trend: gap = {gap!r} rad: must be finite and at least 0")
         covariance = self.covariance[:OFFSET, :OFFSET].copy()
-        covariance[GAP, GAP] += self.settings.shared_error_rad**2
+        covariance[GAP, GAP] += self.settings.shared_error(self.gap) ** 2
         return passage(
             self.mean[:OFFSET],
             covariance,

@@ -49,6 +49,10 @@ class TrendSettings:
             "not its rate.",
         ),
     ] = math.radians(0.02)
+    shared_error_share: Annotated[
+        float,
+        value(minimum=0.0, help="The same as a share of the gap, on top of it: of an axis, as its estimator has it."),
+    ] = 0.0
     outlier_std: Annotated[
         float,
         value(minimum=0.0, help="An estimate that is farther from the prediction is refused, in standard deviations."),
@@ -71,6 +75,10 @@ class TrendSettings:
 
     def __post_init__(self) -> None:
         check(self)
+
+    def shared_error(self, gap: float) -> float:
+        """Error (rad) that all windows of a gap (rad) share."""
+        return math.hypot(self.shared_error_rad, self.shared_error_share * gap)
 
     @classmethod
     def on(cls, second: float) -> TrendSettings:

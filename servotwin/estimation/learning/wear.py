@@ -63,7 +63,7 @@ class Expectation:
         """
         if self.trend is None or self.trend.prior.offset_std >= self.trend.settings.offset_std_rad:
             return None
-        known, shared = self.trend.prior, self.trend.settings.shared_error_rad
+        known, shared = self.trend.prior, self.trend.settings.shared_error(self.trend.gap)
         return known.offset, math.hypot(known.offset_std, 0.5 * shared)
 
     @property
@@ -234,7 +234,7 @@ class Wear(Struct, frozen=True):
         if not rejection:
             seen = Falls(estimate.gap, estimate.std_total)
             if self.falls is not None:
-                shared, sure = settings.shared_error_rad, settings.outlier_std
+                shared, sure = settings.shared_error(seen.gap), settings.outlier_std
                 seen = self.falls.after(estimate, shared, sure, learning.restart_after)
             wear = replace(wear, falls=seen)
         wear = self._with_mismatches(wear, estimate, learning.restart_after)
