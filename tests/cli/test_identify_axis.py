@@ -1,6 +1,7 @@
 """`servotwin identify` on logs of axes made of parts."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,26 @@ def test_a_log_in_other_times_and_angles_has_the_same_gaps_and_trend(
     assert found.until_limit is not None
     assert own_report.until_limit is not None
     assert found.until_limit.interval[0] / time == pytest.approx(own_report.until_limit.interval[0], rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("channel", ["measured_theta_m_rad", "measured_position_rad"])
+def test_lost_counts_between_two_windows_are_said_with_their_size(
+    logs: Path, own_report: Identification, tmp_path: Path, channel: str
+) -> None:
+    """Neither window alone can know, and each shows the gap: the second one's offset is another."""
+    columns = dict(read_log(logs / "own.npz").table().columns)
+    lost = 0.1 * (columns["time_s"] > 1.95)
+    columns[channel] = columns[channel] - lost
+    write_log(SignalTable(columns, {"servo": DRIVE.dumps()}), tmp_path / "log.npz")
+    found = identify(IdentifyOptions(tmp_path / "log.npz", window=1.9))
+    assert own_report.remarks == ((), ())
+    assert found.remarks[0] == ()
+    (said,) = found.remarks[1]
+    size, known = map(float, re.findall(r"by (\S+) ± (\S+) deg of the motor: one has lost counts", said)[0])
+    sign = 1.0 if channel == "measured_theta_m_rad" else -1.0
+    assert abs(size - sign * math.degrees(0.1)) <= known < math.degrees(0.1)
+    assert all(each.interval[0] <= GAP <= each.interval[1] for each in found.estimates)
 
 
 @pytest.mark.slow

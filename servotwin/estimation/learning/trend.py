@@ -307,6 +307,11 @@ class Trend:
         return any(reason.startswith(_AFRESH) for reason in self.reasons)
 
     @property
+    def moved(self) -> bool:
+        """True right after the window with which the encoder's offset has been read anew, the gap being as expected."""
+        return _MOVED in self.reasons
+
+    @property
     def gap(self) -> float:
         """Total gap, rad, at least 0."""
         return max(0.0, float(self.mean[GAP]))

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact
+from servotwin.estimation.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, LastContact
 from servotwin.estimation.learning.falls import Falls
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, updated
 from servotwin.estimation.learning.motor import LearntMotor, MotorLearning
@@ -302,6 +302,13 @@ class Wear(Struct, frozen=True):
             sentences.append(
                 f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(afresh.gap):.3g} deg, as "
                 "after a crash, a repair or a new screw: it is followed from there"
+            )
+        if trend is not None and earlier is not None and trend.moved and not earlier.moved:
+            moved = math.degrees(trend.prior.offset - earlier.prior.offset)
+            known = math.degrees(NORMAL_95 * math.hypot(trend.prior.offset_std, earlier.prior.offset_std))
+            sentences.append(
+                f"the encoders have moved against each other by {moved:.3g} ± {known:.2g} deg of the motor: one has "
+                "lost counts, slips or was homed anew, or the gap wears on one side only"
             )
         return sentences
 

@@ -31,6 +31,7 @@ from servotwin.estimation.output_error.learnt_shaft import (
     shaft_reading,
 )
 from servotwin.estimation.output_error.models import FRICTION_PARTS, MotionModel, Priors, ShaftModel
+from servotwin.estimation.output_error.offset import with_offset
 from servotwin.estimation.output_error.one_way import moves_one_way
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
@@ -160,7 +161,7 @@ def fitted(
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=other)
     if verdict.status is GapStatus.OK and (alike := moves_one_way(axis, window.position)):
         verdict = JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(alike,))
-    stated = _stated(blank, found, verdict, unit)
+    stated = with_offset(_stated(blank, found, verdict, unit), found, unit)
     told = _with_machine(stated, found, possible, settings, machine)
     return FittedWindow(told, found, possible, settings if verdict.one_flank else None)
 
