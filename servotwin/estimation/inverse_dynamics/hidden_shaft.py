@@ -1,4 +1,4 @@
-"""An elasticity behind the motor's encoder: the load's acceleration lags, and the motor's alone gives a wrong inertia."""
+"""An elasticity behind the motor's encoder: the load's acceleration lags, and a rigid fit has a wrong inertia."""
 
 from __future__ import annotations
 
