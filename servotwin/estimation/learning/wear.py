@@ -303,14 +303,7 @@ class Wear(Struct, frozen=True):
                 f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(afresh.gap):.3g} deg, as "
                 "after a crash, a repair or a new screw: it is followed from there"
             )
-        if trend is not None and earlier is not None and trend.moved and not earlier.moved:
-            moved = math.degrees(trend.prior.offset - earlier.prior.offset)
-            known = math.degrees(NORMAL_95 * math.hypot(trend.prior.offset_std, earlier.prior.offset_std))
-            sentences.append(
-                f"the encoders have moved against each other by {moved:.3g} ± {known:.2g} deg of the motor: one has "
-                "lost counts, slips or was homed anew, or the gap wears on one side only"
-            )
-        return sentences
+        return sentences + _moved(trend, earlier)
 
     def remarks(
         self, before: Wear, estimate: GapEstimate, settings: TrendSettings, learning: LearningSettings
@@ -384,3 +377,15 @@ class Wear(Struct, frozen=True):
         if trend is None or boot == self.boot:
             return trend
         return trend.without_offset().on_clock(time - max(0.0, now - self.arrived))
+
+
+def _moved(trend: Trend | None, before: Trend | None) -> list[str]:
+    """Say by how much the encoders have moved against each other, where a window has just shown that."""
+    if trend is None or before is None or not trend.moved or before.moved:
+        return []
+    by = math.degrees(trend.prior.offset - before.prior.offset)
+    known = math.degrees(NORMAL_95 * math.hypot(trend.prior.offset_std, before.prior.offset_std))
+    return [
+        f"the encoders have moved against each other by {by:.3g} ± {known:.2g} deg of the motor: one has "
+        "lost counts, slips or was homed anew, or the gap wears on one side only"
+    ]
