@@ -3,6 +3,7 @@
 It measures the change of the gap since the last window that was sent as news; that window begins a new baseline. After
 an accepted update the baseline counts as a few windows only, and where the update stands on a window that did not show
 the gap here, the baseline moves with the update's gap. A window that does not show the gap changes no baseline.
+News on which no update stands is sent again, ever more rarely: the twin may have rejected the window.
 A response that the twin has learnt takes the place of the configured one, and begins another baseline.
 """
 
@@ -68,6 +69,10 @@ class NoveltyState(Struct, frozen=True, omit_defaults=True, tag="novelty/1", ren
         m, residual (rms) of the last fit; 0: not known.
     response : LearntResponse or None
         Learnt by the twin; None: the configured one is used.
+    unanswered : int or None
+        Sequence of the last news on which no update stands yet; None: there is none.
+    since : int
+        Windows that showed the gap since then; negative: so many unconditional ones come first.
     """
 
     gap: float
@@ -84,6 +89,8 @@ class NoveltyState(Struct, frozen=True, omit_defaults=True, tag="novelty/1", ren
     offset: tuple[float, float] | None = None
     noise: float = 0.0
     response: LearntResponse | None = None
+    unanswered: int | None = None
+    since: int = 0
 
     @property
     def response_version(self) -> int:
@@ -114,13 +121,14 @@ class NoveltyVerdict(NamedTuple):
 
 def start(settings: NoveltySettings) -> NoveltyState:
     """Return the state before the first window."""
-    return NoveltyState(settings.gap, settings.rules.learn)
+    return _awaiting(NoveltyState(settings.gap, settings.rules.learn), 0)
 
 
 def booted(state: NoveltyState, rules: NoveltyRules) -> NoveltyState:
     """Return the state after a restart: the baseline stays; sample times and the encoder's offset begin anew."""
     begun = NoveltyState(state.gap, rules.learn, state.chart, state.version, state.update_gap)
-    return structs.replace(begun, response=state.response)
+    begun = structs.replace(begun, response=state.response)
+    return begun if state.update_gap is not None and state.unanswered is None else _awaiting(begun, 0)
 
 
 def adopted(state: NoveltyState, response: LearntResponse, settings: NoveltySettings) -> NoveltyState:
@@ -172,13 +180,30 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
     charted = add_window(state.chart, estimate.gap, std, rules)
     far = abs(estimate.gap - state.chart.anchor) > rules.outlier
     news = SCORE if charted.sudden else CUSUM if charted.slow else LOST_MOTION if _lost(state, rules) else ""
-    state = structs.replace(_after_score(state, cut, estimate, rules), chart=charted.chart)
+    state = _repeating(structs.replace(_after_score(state, cut, estimate, rules), chart=charted.chart), rules)
     reason = _reason(state, cut, settings, news)
     if news:
-        state = structs.replace(state, unconditional=rules.confirm if far else 0)
+        state = _awaiting(structs.replace(state, unconditional=rules.confirm if far else 0), cut.sequence)
     elif state.unconditional and reason:
         state = structs.replace(state, unconditional=state.unconditional - 1)
     return _sent(state, cut, settings, reason), NoveltyVerdict(reason, estimate, charted.change, _range(state))
+
+
+def _awaiting(state: NoveltyState, sequence: int) -> NoveltyState:
+    """Await an update that stands on a window as new as this one, from the end of the unconditional ones on."""
+    return structs.replace(state, unanswered=sequence, since=-state.unconditional)
+
+
+def _repeating(state: NoveltyState, rules: NoveltyRules) -> NoveltyState:
+    """Have windows sent again after 2, 6, 14 ... without an update: the twin may have rejected the news.
+
+    Each time as many as after a start, because steps to and fro show one flank and the other by turns.
+    """
+    if state.unanswered is None:
+        return state
+    since = state.since + 1
+    due = since > 1 and (since + 1) & (since + 2) == 0
+    return structs.replace(state, since=since, unconditional=max(state.unconditional, rules.learn if due else 0))
 
 
 def _after_score(state: NoveltyState, cut: Cut, estimate: Score, rules: NoveltyRules) -> NoveltyState:
@@ -252,7 +277,9 @@ def _updated(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> NoveltyState
     state = structs.replace(state, version=cut.parameter_version)
     if cut.gap is None:
         return state
-    return structs.replace(state, chart=_relearnt(state, cut, rules), update_gap=cut.gap, unconditional=0)
+    state = structs.replace(state, chart=_relearnt(state, cut, rules), update_gap=cut.gap, unconditional=0)
+    earlier = state.unanswered is not None and cut.basis is not None and cut.basis < state.unanswered
+    return state if earlier else structs.replace(state, unanswered=None, since=0)
 
 
 def _relearnt(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:

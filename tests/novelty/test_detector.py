@@ -65,6 +65,11 @@ def updated(each: Cut, version: int, gap_deg: float, basis: int) -> Cut:
     return each._replace(parameter_version=version, gap=math.radians(gap_deg), basis=basis)
 
 
+def told(each: Cut, basis: int) -> Cut:
+    """Cut under an update to 10 deg that stands on a window."""
+    return updated(each, 1 + basis, 10.0, basis)
+
+
 def quiet(sequence: int) -> Cut:
     noise = 1e-6 * np.random.default_rng(sequence).standard_normal(5000)
     return made(np.zeros(5000), noise, sequence)
@@ -85,8 +90,42 @@ def reasons(novelty: NoveltyDetector, cuts: list[Cut]) -> list[str]:
 
 def test_the_first_are_sent_then_none_until_the_gap_changes() -> None:
     novelty = NoveltyDetector(SETTINGS)
-    found = reasons(novelty, [*(cut(k) for k in range(8)), *(cut(k, 10.5) for k in range(8, 14))])
-    assert found == [FIRST, FIRST, *[""] * 6, SCORE, *[""] * 5]
+    found = reasons(novelty, [cut(0), cut(1), *(told(cut(k), 1) for k in range(2, 8)), told(cut(8, 10.5), 1)])
+    assert found == [FIRST, FIRST, *[""] * 6, SCORE]
+    assert reasons(novelty, [told(cut(k, 10.5), 8) for k in range(9, 14)]) == [""] * 5
+
+
+def test_what_no_update_answers_is_sent_again_ever_more_rarely() -> None:
+    """The twin may have rejected the windows: without an update it does not know the gap."""
+    novelty = NoveltyDetector(SETTINGS)
+    found = reasons(novelty, [cut(k) for k in range(20)])
+    assert [k for k, reason in enumerate(found) if reason] == [0, 1, 3, 4, 7, 8, 15, 16]
+    assert set(found) == {FIRST, ""}
+
+
+def test_news_that_no_update_answers_is_sent_again_ever_more_rarely() -> None:
+    novelty = NoveltyDetector(SETTINGS)
+    reasons(novelty, [cut(0), *(told(cut(k), 0) for k in range(1, 4))])
+    found = reasons(novelty, [told(cut(k, 10.5), 0) for k in range(4, 16)])
+    assert [k for k, reason in enumerate(found) if reason] == [0, 2, 3, 6, 7]
+    assert found[0] == SCORE
+
+
+def test_an_update_from_before_the_news_does_not_answer_it() -> None:
+    novelty = NoveltyDetector(SETTINGS)
+    reasons(novelty, [cut(0), *(told(cut(k), 0) for k in range(1, 4))])
+    found = reasons(novelty, [told(cut(4, 10.5), 0), *(told(cut(k, 10.5), 3) for k in range(5, 8))])
+    assert found == [SCORE, "", FIRST, FIRST]
+
+
+def test_after_a_restart_only_unanswered_news_is_sent_again() -> None:
+    answered = NoveltyDetector(SETTINGS)
+    reasons(answered, [cut(0), *(told(cut(k), 0) for k in range(1, 4))])
+    unanswered = NoveltyDetector(SETTINGS, answered.state)
+    assert reasons(unanswered, [told(cut(k), 0) for k in range(12)]) == [FIRST, FIRST, *[""] * 10]
+    reasons(answered, [told(cut(4, 10.5), 0)])
+    again = NoveltyDetector(SETTINGS, answered.state)
+    assert reasons(again, [told(cut(k, 10.5), 0) for k in range(6)]) == [FIRST, FIRST, "", FIRST, FIRST, ""]
 
 
 @pytest.mark.parametrize("units", [Units(time=2.0**-10), Units(time=1e3, length=1e-6, voltage=1e2)])
@@ -106,8 +145,8 @@ def test_a_machine_in_other_units_sends_the_same_windows(units: Units) -> None:
 
 
 def test_what_may_be_an_outlier_to_the_twin_is_sent_twice() -> None:
-    found = reasons(NoveltyDetector(SETTINGS), [*(cut(k) for k in range(4)), *(cut(k, 12.0) for k in range(4, 8))])
-    assert found == [FIRST, FIRST, "", "", SCORE, FIRST, "", ""]
+    cuts = [cut(0), *(told(cut(k), 0) for k in range(1, 4)), *(told(cut(k, 12.0), 0) for k in range(4, 7))]
+    assert reasons(NoveltyDetector(SETTINGS), cuts) == [FIRST, "", "", "", SCORE, FIRST, ""]
 
 
 def test_an_accepted_update_ends_the_unconditional_windows_and_keeps_the_news_out() -> None:
@@ -128,16 +167,16 @@ def test_an_update_from_a_window_without_a_score_moves_the_baseline() -> None:
 def test_slow_wear_is_news_by_its_sum() -> None:
     novelty = NoveltyDetector(SETTINGS)
     gaps = [*[10.0] * 8, *(10.0 + 0.01 * k for k in range(1, 8))]
-    found = reasons(novelty, [cut(k, gap) for k, gap in enumerate(gaps)])
-    assert found[2:8] == [""] * 6
+    found = reasons(novelty, [told(cut(k, gap), 0) for k, gap in enumerate(gaps)])
+    assert found[:8] == [""] * 8
     assert CUSUM in found[8:]
 
 
 def test_a_window_without_motion_moves_nothing() -> None:
     state = start(SETTINGS)
     for number in range(6):
-        state, _ = judge(state, cut(number), SETTINGS)
-    after, verdict = judge(state, quiet(6), SETTINGS)
+        state, _ = judge(state, told(cut(number), 0), SETTINGS)
+    after, verdict = judge(state, told(quiet(6), 0), SETTINGS)
     assert (verdict.reason, verdict.score, after.chart) == ("", None, state.chart)
     assert after.uninformative == 1
 
@@ -150,7 +189,8 @@ def test_windows_that_say_nothing_are_sent_a_few_times_at_first() -> None:
 def test_one_is_sent_every_period_and_a_probe_always() -> None:
     rules = NoveltyRules(period_s=100.0)
     novelty = NoveltyDetector(replace(SETTINGS, rules=rules))
-    found = reasons(novelty, [cut(k, reason=PROBE if k == 3 else "reference") for k in range(16)])
+    cuts = [cut(k, reason=PROBE if k == 3 else "reference") for k in range(16)]
+    found = reasons(novelty, [*cuts[:2], *(told(each, 1) for each in cuts[2:])])
     assert found == [FIRST, FIRST, "", PROBE, *[""] * 4, PERIODIC, *[""] * 4, PERIODIC, "", ""]
 
 
