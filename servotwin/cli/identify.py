@@ -165,7 +165,7 @@ def _followed_without_wear(
 
 
 def _known_of_gap(seen: Plant) -> dict[str, Any]:
-    """What is known of an axis's gap before its windows, and of the error that they share: no angle of another machine.
+    """Trend settings for the gap before its windows and the error that they share: no angle of another machine.
 
     Empty where the estimator itself counts its error as an angle, as that of a servo does.
     """

@@ -202,37 +202,6 @@ def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -
             here.deliver(parcel(0))
 
 
-def test_polls_that_somebody_replays_hold_nothing(server: Mosquitto, store: Store) -> None:
-    """They would use up the polls of their servo, and its rate: who reads the broker's topics needs no token."""
-    recorded, ready, times = list[bytes](), threading.Event(), 30
-
-    def record(_topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        acknowledge()
-        recorded.append(payload)
-
-    callbacks = MqttCallbacks(record, lambda _: ready.set(), lambda _: None)
-    topic, heard = wire.request_topic("axis-1"), list[list[bytes]]()
-    intruder = Connection(Broker(server.url), MqttSession("intruder", (topic,), 0), callbacks)
-    try:
-        assert ready.wait(PATIENCE)
-        with twin(Broker(server.url), store) as there, edge(Broker(server.url), wait_s=25.0) as here:
-            here.deliver(parcel(0))
-            poll = threading.Thread(target=lambda: heard.append(here.listen(0)))
-            poll.start()
-            until(lambda: len(recorded) == 2 and there.polls.open == 1)
-            for _ in range(times):
-                for payload in recorded[:2]:
-                    assert intruder.publish(topic, payload, 60.0) is not None
-            until(lambda: there.metrics.repeated.values[()] == 2 * times)
-            assert there.polls.open == 1
-            there.post("axis-1", b"update")
-            poll.join(PATIENCE)
-            assert [len(messages) for messages in heard] == [1]
-            assert refusals(there) == {}
-    finally:
-        intruder.close()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [wire.request_topic, wire.response_topic])
 def test_a_broker_that_swaps_its_clients_topics_loses_nothing_and_brings_no_update_to_the_wrong_edge(

@@ -1,18 +1,20 @@
-"""Requests over a broker that are sent again, and what comes late of their copies."""
+"""Requests over a broker that are sent again or replayed, and what comes late of their copies."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from mosquitto import Mosquitto
-from mqttparts import PATIENCE, edge, kept, parcel, twin
+from mqttparts import PATIENCE, edge, kept, parcel, refusals, twin
 from mqttrelay import MqttRelay
+from waiting import until
 
 from servotwin.link import mqtt, round_trip
 from servotwin.link import mqtt_messages as wire
-from servotwin.link.broker import Broker, MqttCallbacks, MqttSession
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.store.store import Store
@@ -83,3 +85,34 @@ def test_a_late_report_of_a_copy_that_nobody_waits_for_says_nothing_of_a_later_r
     made[0].events.not_delivered(7, "")
     link.deliver(parcel(1))
     link.close()
+
+
+def test_polls_that_somebody_replays_hold_nothing(server: Mosquitto, store: Store) -> None:
+    """They would use up the polls of their servo, and its rate: who reads the broker's topics needs no token."""
+    recorded, ready, times = list[bytes](), threading.Event(), 30
+
+    def record(_topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
+        acknowledge()
+        recorded.append(payload)
+
+    callbacks = MqttCallbacks(record, lambda _: ready.set(), lambda _: None)
+    topic, heard = wire.request_topic("axis-1"), list[list[bytes]]()
+    intruder = Connection(Broker(server.url), MqttSession("intruder", (topic,), 0), callbacks)
+    try:
+        assert ready.wait(PATIENCE)
+        with twin(Broker(server.url), store) as there, edge(Broker(server.url), wait_s=25.0) as here:
+            here.deliver(parcel(0))
+            poll = threading.Thread(target=lambda: heard.append(here.listen(0)))
+            poll.start()
+            until(lambda: len(recorded) == 2 and there.polls.open == 1)
+            for _ in range(times):
+                for payload in recorded[:2]:
+                    assert intruder.publish(topic, payload, 60.0) is not None
+            until(lambda: there.metrics.repeated.values[()] == 2 * times)
+            assert there.polls.open == 1
+            there.post("axis-1", b"update")
+            poll.join(PATIENCE)
+            assert [len(messages) for messages in heard] == [1]
+            assert refusals(there) == {}
+    finally:
+        intruder.close()
