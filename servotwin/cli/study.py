@@ -19,6 +19,9 @@ SampleRate = Annotated[
     float | None,
     typer.Option("--rate", help="Sample rate, Hz; replaces the log's own times."),
 ]
+TimeUnit = Annotated[
+    str | None, typer.Option("--time-unit", help="Unit of the time, such as ms, if the header does not state it.")
+]
 MotorUnit = Annotated[
     str | None,
     typer.Option("--motor-unit", help="Unit of --motor, such as deg or mm, if the header does not state it."),
@@ -93,6 +96,7 @@ def convert(
     rate: SampleRate = None,
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
+    time_unit: TimeUnit = None,
 ) -> None:
     """Convert a recorded log to another format. Damaged samples of foreign logs are repaired or left out."""
     from servotwin.cli.simulate import convert as run
@@ -100,7 +104,7 @@ def convert(
     from servotwin.logs.log import holds_signals
     from servotwin.logs.recordings import RecordingColumns
 
-    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
+    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit, time_unit)
     if columns == RecordingColumns() and holds_signals(log):
         run(log, output)
         return
@@ -117,6 +121,7 @@ def identify(
     rate: SampleRate = None,
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
+    time_unit: TimeUnit = None,
     lead_mm: LeadMm = None,
     ratio: Ratio = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
@@ -179,7 +184,7 @@ def identify(
     from servotwin.logs.log import describes_its_machine
     from servotwin.logs.recordings import RecordingColumns
 
-    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
+    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit, time_unit)
     options = IdentifyOptions(
         log=logs[0],
         servo=servo,
@@ -227,6 +232,7 @@ def commission(
     motor_unit: MotorUnit = None,
     reference_unit: Annotated[str | None, typer.Option(help="Unit of --reference if the position has another.")] = None,
     load_unit: LoadUnit = None,
+    time_unit: TimeUnit = None,
     command_unit: Annotated[
         str | None, typer.Option(help="Unit of --command (N, 'N m', A or V) if the header does not state it.")
     ] = None,
@@ -287,7 +293,7 @@ def commission(
     travel = stated_travel(lead_mm, ratio)
     columns = DriveColumns(
         motor, command, reference, load, time, rate, motor_unit, command_unit, reference_unit, load_unit, scale,
-        None if travel is None else travel.per_radian,
+        None if travel is None else travel.per_radian, time_unit,
     )  # fmt: skip
     show(
         CommissionOptions(

@@ -19,6 +19,7 @@ from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.identify import GivenLaw, IdentifiedDrive, identify_drive
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse
+from servotwin.logs.clocks import WHOLE
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
@@ -119,7 +120,7 @@ def commission(
     scale = first.force_per_command
     gains = gains if scale is None else gains.scaled(abs(scale))
     travel = 1.0 if read[0].travel is None else read[0].travel
-    drive = _without_hidden_shaft(read[0], identify_drive([each.recording for each in read], gains, travel, applied))
+    drive = _without_hidden_shaft(read[0], _identified(read, gains, travel, applied))
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
     lag = drive.refinement.lag if drive.refinement is not None and drive.refinement.converged else 0.0
     axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel, lag)
@@ -135,6 +136,16 @@ def commission(
         # That of the loop as it is now, with the shaft and the gains found.
         axis = replace(axis, controller=axis.controller.replace(release_time=None))
     return replace(found, axis=axis, uncertainty=_uncertainty(found, travel))
+
+
+def _identified(logs: Sequence[DriveLog], gains: GivenLaw, travel: float, applied: bool) -> IdentifiedDrive:
+    """The drive that the logs show; a refusal names times whose unit was assumed."""
+    try:
+        return identify_drive([log.recording for log in logs], gains, travel, applied)
+    except InvalidInput as error:
+        if any(WHOLE in log.found for log in logs):
+            raise InvalidInput(f"{error}; or its {WHOLE}") from None
+        raise
 
 
 def _check_alike(logs: Sequence[DriveLog]) -> None:
@@ -157,7 +168,8 @@ def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenLaw, applied: 
             f"{first.source}: the force per command is known already ({first.force_per_command:g} {first.force_unit}): "
             "leave out --inertia"
         )
-    unscaled = identify_drive([replace(log.recording, reference=None) for log in logs], gains, 1.0, applied)
+    bare = [replace(log, recording=replace(log.recording, reference=None)) for log in logs]
+    unscaled = _identified(bare, gains, 1.0, applied)
     scale = inertia / unscaled.symmetric["inertia"]
     return tuple(
         replace(log, recording=replace(log.recording, force=log.recording.force * scale, force_per_command=scale))

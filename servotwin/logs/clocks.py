@@ -13,6 +13,7 @@ from servotwin.plant.signals import Array
 
 MIDNIGHTS = "midnights, at which the time of day began anew"
 HOURS_BACK = "hours that the clock was set back, as it is in autumn"
+WHOLE = "times in whole numbers of no stated unit, read as seconds; say --time-unit ms where they are milliseconds"
 _DAY, _HOUR = 86400.0, 3600.0  # s
 _SECONDS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
@@ -67,6 +68,13 @@ _EPOCHS = (
 )
 
 
+def check_rate(path: Path, time: str | None, unit: str | None, rate: float | None) -> None:
+    """Refuse a sample rate (Hz) beside a column of times or its unit: it replaces the times."""
+    for option, value in (("--time", time), ("--time-unit", unit)):
+        if rate is not None and value is not None:
+            raise InvalidInput(f"log {path}: {option} {value!r} and --rate {rate:g}: give one of the two")
+
+
 class LogClock:
     """Times of one log, block after block.
 
@@ -75,7 +83,7 @@ class LogClock:
     path : Path
         For messages.
     unit : str
-        Of the times, as the header says; empty: seconds, or what their size shows.
+        Of the times, as the header or the user says; empty: seconds, or what their size shows.
     rate : float or None
         Hz, of a log without times.
 
@@ -125,6 +133,8 @@ class LogClock:
             self.found[name] = self.found.get(name, 0) + size
             result = times * self._epoch.unit + self._epoch.begin
         else:
+            if not self._unit:
+                self._note_whole(times)
             result = self._continued(times * _SECONDS.get(self._unit, 1.0))
         self._note_set_back(result, before)
         return result
@@ -136,6 +146,12 @@ class LogClock:
         if usual > 0.0 and abs(rate * usual - 1.0) > _OTHER_RATE:
             name = f"samples timed by --rate {rate:g} Hz, though the log's own times say {1.0 / usual:.4g} Hz"
             self.found[name] = self.found.get(name, 0) + times.size
+
+    def _note_whole(self, times: Array) -> None:
+        """Note what looks like milliseconds, though nothing says so: logs of encoders have fractions of seconds."""
+        known = times[np.isfinite(times)]
+        if known.size and np.all(known == np.round(known)):
+            self._count(WHOLE, known.size)
 
     def _note_set_back(self, times: Array, before: int) -> None:
         known = np.flatnonzero(np.isfinite(times))
@@ -163,7 +179,7 @@ class LogClock:
             midnights = np.where(np.abs(steps) > 0.5 * _DAY, -np.sign(steps), 0.0)
             self._count(MIDNIGHTS, int(np.sum(np.abs(midnights))))
             shifts += _DAY * midnights
-        back = np.abs(steps + _HOUR) <= _CONTINUES * usual
+        back = (steps < 0.0) & (np.abs(steps + _HOUR) <= _CONTINUES * usual)
         self._count(HOURS_BACK, int(np.sum(back)))
         shifts += _HOUR * back
         moved = self._shift + np.cumsum(shifts)

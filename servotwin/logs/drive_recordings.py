@@ -16,7 +16,7 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.estimation.kinematic.travel import ANGLES, LENGTHS
 from servotwin.logs.cleaning import cleaned
-from servotwin.logs.clocks import LogClock
+from servotwin.logs.clocks import LogClock, check_rate
 from servotwin.logs.log import read_columns
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
 from servotwin.logs.recordings import CUT, TIME_NAMES, TURNED, check_left, check_one_log, is_newest_first, numbers_of
@@ -47,7 +47,7 @@ class DriveColumns:
     motor, command, reference, load, time : str or None
     rate : float or None
         Hz, of a log without times.
-    motor_unit, command_unit, reference_unit, load_unit : str or None
+    motor_unit, command_unit, reference_unit, load_unit, time_unit : str or None
         Where the header does not say them; the reference's is the motor's, or the load's where there is one.
     force_per_command : float or None
         N (of a rotary axis N m) at the load per unit of the command.
@@ -67,6 +67,7 @@ class DriveColumns:
     load_unit: str | None = None
     force_per_command: float | None = None
     travel: float | None = None
+    time_unit: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +251,7 @@ def _grid(time: Array) -> tuple[Array, Mask, float]:
 
 def _chosen(path: Path, names: tuple[str, ...], wanted: DriveColumns) -> dict[str, str]:
     """Name of the column of each part."""
-    if wanted.rate is not None and wanted.time is not None:
-        raise InvalidInput(f"log {path}: --time {wanted.time!r} and --rate {wanted.rate:g}: give one of the two")
+    check_rate(path, wanted.time, wanted.time_unit, wanted.rate)
     result: dict[str, str] = {}
     for part in _PARTS:
         given: str | None = getattr(wanted, part)

@@ -15,7 +15,7 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.estimation.kinematic.travel import ANGLES
 from servotwin.logs.cleaning import BETWEEN, OUT_OF_ORDER, REPEATED, SAME_TIME, Cleaned
-from servotwin.logs.clocks import LogClock
+from servotwin.logs.clocks import LogClock, check_rate
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks
@@ -50,7 +50,7 @@ class RecordingColumns:
     motor, load, command, time : str or None
     rate : float or None
         Hz, of a log without times.
-    motor_unit, load_unit : str or None
+    motor_unit, load_unit, time_unit : str or None
         Where the header does not say them.
     """
 
@@ -61,6 +61,7 @@ class RecordingColumns:
     rate: float | None = None
     motor_unit: str | None = None
     load_unit: str | None = None
+    time_unit: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,7 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
     load_unit = known_unit(wanted.load_unit or units["load"]) or "load unit"
     both = {"motor": motor_unit, "load": load_unit}
     turns = {part: 2.0 * np.pi / ANGLES[unit] for part, unit in both.items() if unit in ANGLES}
-    clock = LogClock(path, units.get("time", ""), wanted.rate)
+    clock = LogClock(path, wanted.time_unit or units.get("time", ""), wanted.rate)
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
     cut = turned = False
     for table in _oldest_first(_tables(path, chosen, clock, chain([first], blocks))):
@@ -232,8 +233,7 @@ def check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]
 def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[str, str]:
     """Name of the column of each part."""
     result: dict[str, str] = {}
-    if wanted.rate is not None and wanted.time is not None:
-        raise InvalidInput(f"log {path}: --time {wanted.time!r} and --rate {wanted.rate:g}: give one of the two")
+    check_rate(path, wanted.time, wanted.time_unit, wanted.rate)
     for part in ("time", "motor", "load", "command"):
         given = getattr(wanted, part)
         name = given_column(path, part, given, names) if given is not None else guessed_column(_GUESSES[part], names)

@@ -66,6 +66,19 @@ def test_units_at_the_end_of_a_name_are_those_in_brackets(log, tmp_path):
     assert "kg m^2" in run(torque).output
 
 
+def test_times_that_may_be_milliseconds_are_named(tmp_path):
+    recording, header = simulated(), "time,motor [mm],force [N],reference [mm]"
+    time = np.round(1e3 * np.arange(recording.position.size) / recording.rate)
+    path = written(tmp_path / "log.csv", recording, header, t=time)
+    remark = "say --time-unit ms where they are milliseconds"
+    assert remark in " ".join(run(path).output.split())
+    assert remark not in " ".join(run(path, "--time-unit", "ms").output.split())
+    noise = np.random.default_rng(1).standard_normal(time.size)
+    refused = run(written(tmp_path / "noise.csv", recording, header, t=time, force=noise))
+    assert refused.exit_code == 2
+    assert remark in " ".join(refused.output.split())
+
+
 def test_a_pid_is_stated_or_a_cascade(log):
     result = run(log, "--kp", 6e4, "--position-gain", 25)
     assert result.exit_code == 2

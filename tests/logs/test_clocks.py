@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
 from servotwin.logs import csv_file
-from servotwin.logs.clocks import HOURS_BACK, MIDNIGHTS, LogClock
+from servotwin.logs.clocks import HOURS_BACK, MIDNIGHTS, WHOLE, LogClock
 from servotwin.logs.dates import time_of
 from servotwin.logs.names import known_unit, named_unit
 from servotwin.logs.recordings import RecordingColumns, read_recording
@@ -83,6 +83,25 @@ def test_times_of_reversals_count_from_the_first_sample_of_a_dated_log(tmp_path)
 def test_seconds_stay_seconds(first):
     times = first + MADE.time
     assert np.array_equal(LogClock("log", "", None).seconds(times, times.size), times)
+
+
+def test_whole_numbers_without_a_unit_are_remarked_on_and_may_be_milliseconds(tmp_path):
+    path = written(tmp_path / "log.csv", [f"{1e3 * t:.0f}" for t in MADE.time])
+    said = read_recording(path, RecordingColumns())
+    assert said.found == {WHOLE: MADE.time.size}
+    assert np.ptp(said.recording.time) == pytest.approx(1e3 * np.ptp(MADE.time))
+    stated = read_recording(path, RecordingColumns(time_unit="ms"))
+    assert stated.found == {}
+    assert np.allclose(stated.recording.time, MADE.time)
+    with pytest.raises(InvalidInput, match="--time-unit 'ms' and --rate 200: give one of the two"):
+        read_recording(path, RecordingColumns(time_unit="ms", rate=200.0))
+
+
+def test_steps_of_a_quarter_of_an_hour_are_no_clock_set_back():
+    clock = LogClock("log", "", None)
+    times = 900.0 * np.arange(50.0)
+    assert np.array_equal(clock.seconds(times, times.size), times)
+    assert HOURS_BACK not in clock.found
 
 
 def test_units_of_time(tmp_path):
