@@ -24,7 +24,7 @@ TimeUnit = Annotated[
 ]
 MotorUnit = Annotated[
     str | None,
-    typer.Option("--motor-unit", help="Unit of --motor, such as deg or mm, if the header does not state it."),
+    typer.Option("--motor-unit", help="Unit of --motor, such as deg or rev/4096, if the header does not state it."),
 ]
 LoadUnit = Annotated[
     str | None, typer.Option("--load-unit", help="Unit of --load, such as mm, if the header does not state it.")

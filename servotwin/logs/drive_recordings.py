@@ -18,7 +18,7 @@ from servotwin.estimation.kinematic.travel import ANGLES, LENGTHS
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.clocks import LogClock, check_rate
 from servotwin.logs.log import read_columns
-from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
+from servotwin.logs.names import divided_unit, given_column, guessed_column, known_unit, named_unit
 from servotwin.logs.recordings import CUT, TIME_NAMES, TURNED, check_left, check_one_log, is_newest_first, numbers_of
 from servotwin.plant.signals import Array
 
@@ -115,7 +115,9 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         raise InvalidInput(
             f"log {path}: its columns {', '.join(chosen.values())} have different lengths: one table is needed"
         )
-    units = {part: _unit(path, part, chosen, wanted) for part in chosen}
+    parts = {part: divided_unit(_unit(path, part, chosen, wanted)) for part in chosen}
+    units = {part: unit for part, (unit, _) in parts.items()}
+    arrays = {part: values / parts[part][1] for part, values in arrays.items()}
     clock = LogClock(path, units.get("time", ""), wanted.rate)
     size = sizes.pop()
     time = clock.seconds(arrays.pop("time", None), size)
@@ -281,9 +283,10 @@ def _unit(path: Path, part: str, chosen: Mapping[str, str], wanted: DriveColumns
         return unit
     if not unit and part == "reference":
         return _unit(path, "load" if "load" in chosen else "motor", chosen, wanted)
-    if unit not in _POSITIONS:
+    if divided_unit(unit)[0] not in _POSITIONS:
         shown = f"is in {unit!r}" if unit else "does not say its unit"
         raise InvalidInput(
-            f"log {path}: column {chosen[part]!r} {shown}: give --{part}-unit, one of {', '.join(_POSITIONS)}"
+            f"log {path}: column {chosen[part]!r} {shown}: give --{part}-unit, one of {', '.join(_POSITIONS)}, or "
+            "of counts the part of one, such as rev/4096"
         )
     return unit

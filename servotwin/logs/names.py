@@ -28,6 +28,7 @@ _ALIASES: Mapping[str, str] = {
     **{unit: unit for unit in ("deg", "rad", "mrad", "rev", "mm", "µm", "um", "ms")},
 }
 _KNOWN = {*ANGLES, *LENGTHS, "s", "sec", "ms", "us", "µs", "ns", "min", "h"}
+_PART = re.compile(r"^(?P<unit>\D.*?)\s*/\s*(?P<parts>\d+(\.\d+)?)$")
 _BEHIND_COMMA = re.compile(r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>[^\s,/\d]+|N m)\s*$")
 _COMMANDS = ("V", "A", "N", "N m", "Nm")
 
@@ -86,6 +87,13 @@ def known_unit(unit: str) -> str:
     """A unit as the package writes it: `deg` for `Degrees`, `mm` for `MM`; an unknown one as it is."""
     bare = unit.strip()
     return bare if bare in _KNOWN else _ALIASES.get(bare.lower(), bare)
+
+
+def divided_unit(unit: str) -> tuple[str, float]:
+    """A unit and by what it is divided: of `rev/4096`, counts of an encoder with 4096 in a turn, `rev` and 4096."""
+    found = _PART.match(unit)
+    parts = float(found["parts"]) if found else 0.0
+    return (known_unit(found["unit"]), parts) if found and parts > 0.0 else (unit, 1.0)
 
 
 def _parted(name: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from servotwin.logs.clocks import LogClock, check_rate
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks
-from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
+from servotwin.logs.names import divided_unit, given_column, guessed_column, known_unit, named_unit
 from servotwin.plant.signals import Array
 
 CUT = "last row without its end (the file may have been cut off there)"
@@ -107,9 +107,10 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
     if first is None:
         raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     units = {part: named_unit(name) for part, name in chosen.items()}
-    motor_unit = known_unit(wanted.motor_unit or units["motor"]) or "motor unit"
-    load_unit = known_unit(wanted.load_unit or units["load"]) or "load unit"
+    motor_unit, motor_parts = divided_unit(known_unit(wanted.motor_unit or units["motor"]) or "motor unit")
+    load_unit, load_parts = divided_unit(known_unit(wanted.load_unit or units["load"]) or "load unit")
     both = {"motor": motor_unit, "load": load_unit}
+    divisors = {"motor": motor_parts, "load": load_parts}
     turns = {part: 2.0 * np.pi / ANGLES[unit] for part, unit in both.items() if unit in ANGLES}
     clock = LogClock(path, wanted.time_unit or units.get("time", ""), wanted.rate)
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
@@ -117,7 +118,8 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
     for table in _oldest_first(_tables(path, chosen, clock, chain([first], blocks))):
         damaged, cut, turned = {**table.damaged, **damaged}, table.cut, table.turned
         for begin in range(0, len(table.time), _BLOCK):
-            part = {name: values[begin : begin + _BLOCK] for name, values in table.channels.items()}
+            block = ((name, values[begin : begin + _BLOCK]) for name, values in table.channels.items())
+            part = {name: values / divisors.get(name, 1.0) for name, values in block}
             # Thinned samples lie further apart: counts are those of the first block.
             counts = counts or {name: resolution(values[np.isfinite(values)]) for name, values in part.items()}
             try:

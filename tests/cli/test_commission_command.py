@@ -79,6 +79,19 @@ def test_times_that_may_be_milliseconds_are_named(tmp_path):
     assert remark in " ".join(refused.output.split())
 
 
+def test_counts_are_parts_of_a_turn(log, tmp_path):
+    recording = simulated()
+    counts = {name: np.round(4096 * 100.0 * values) for name, values in
+              (("motor", recording.position), ("reference", recording.reference))}  # fmt: skip
+    path = written(tmp_path / "log.csv", recording, "t [s],motor [counts],force [N],reference [counts]", **counts)
+    assert "or of counts the part of one, such as rev/4096" in " ".join(run(path, "--lead-mm", 10).output.split())
+    said = run(path, "--lead-mm", 10, "--motor-unit", "rev/4096", "--reference-unit", "mm/409.6", "--json")
+    fits = (json.loads(each.stdout)["simulated_loop"]["symmetric"]["parameters"] for each in (said, run(log, "--json")))
+    seen, known = (fit["inertia"] for fit in fits)
+    assert abs(seen["value"] - known["value"]) < seen["half_width_95"]
+    assert seen["unit"] == "kg"
+
+
 def test_a_pid_is_stated_or_a_cascade(log):
     result = run(log, "--kp", 6e4, "--position-gain", 25)
     assert result.exit_code == 2

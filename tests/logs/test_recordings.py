@@ -43,6 +43,9 @@ def test_tables_of_text(tmp_path, made):
     assert (bracketed.recording.motor_unit, bracketed.recording.load_unit) == ("deg", "mm")
     units = csv(tmp_path / "d.csv", values, "t,qa,qb\ns,rad,um", ";")
     assert seen(units, made, RecordingColumns(motor="qa", load="qb")).recording.load_unit == "um"
+    counts = csv(tmp_path / "f.csv", values * [1.0, 4096.0, 500.0], "t [s],motor,load [mm/500]")
+    parts = seen(counts, made, RecordingColumns(motor_unit="rev/4096"))
+    assert (parts.recording.motor_unit, parts.recording.load_unit) == ("rev", "mm")
     bare = tmp_path / "e.dat"
     np.savetxt(bare, values)
     seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))
