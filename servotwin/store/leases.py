@@ -19,6 +19,8 @@ from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, message
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
+LONGEST_HOLD_S = 120.0
+"""s for which a servo is held, at most."""
 
 
 class Turn(NamedTuple):
@@ -44,7 +46,8 @@ def acquire(
     places, and a single place goes to the servo that has waited longest for either. Of estimates one servo.
     """
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
-    bound = {"_now": now, "_late": until + (until - now), "_ahead": _ahead(now)} | (
+    late = now + 2.0 * max(until - now, LONGEST_HOLD_S)
+    bound = {"_now": now, "_late": late, "_ahead": _ahead(now)} | (
         {} if only is None else {"_only": only}
     )
     new, estimates, backlogs = _queues(frozenset(kinds), only is not None)

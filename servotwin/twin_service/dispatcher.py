@@ -14,6 +14,7 @@ from contextlib import suppress
 from functools import partial
 
 from servotwin.store.engine import StoreUnavailable
+from servotwin.store.leases import LONGEST_HOLD_S
 from servotwin.store.records import Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.evidence_lines import count_evidence, write_evidence
@@ -28,7 +29,9 @@ from servotwin.twin_service.worker_pool import WorkerPool
 
 log = logging.getLogger(__name__)
 
-LEASE_S, _POLL_S, _RETRY_S = 120.0, 0.5, 1.0
+LEASE_S, _POLL_S, _RETRY_S = 10.0, 0.5, 1.0
+"""A lease is short, so that those of a process that was killed, or of a database that was restored, soon end by
+themselves: no other process can tell whether their owner lives."""
 _RENEWALS = 4.0
 """Renewals of a lease within its time while a worker is at work, however long that takes."""
 _GATHER_S = 0.02
@@ -327,7 +330,7 @@ class Dispatcher:
         """Let the other servos come first after one that took long."""
         if hold := self._pace.hold(seconds):
             with suppress(StoreUnavailable):
-                await self._executor.run(partial(self._store.hold, servo, self._clocks.wall() + min(hold, LEASE_S)))
+                await self._executor.run(partial(self._store.hold, servo, self._clocks.wall() + min(hold, LONGEST_HOLD_S)))
 
     async def _committed(self, result: WorkResult) -> bool:
         counts = self._metrics.results

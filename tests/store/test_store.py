@@ -8,6 +8,7 @@ from store_cases import bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
+from servotwin.store.leases import LONGEST_HOLD_S
 from servotwin.store.records import Backlog, EvidenceRecord, Lease, MessageKind, OutgoingMessage, PutResult
 from servotwin.store.schema import bodies, contexts, evidence, messages, outgoing, twins
 from servotwin.store.store import Store, open_store
@@ -86,6 +87,13 @@ def test_a_lease_from_before_a_clock_was_set_back_has_ended(store: Store) -> Non
     assert claim(store, "you", now=8980.0) == []
     assert len(claim(store, "you", now=200.0)) == 1
     assert claim(store, now=201.0) == []
+
+
+def test_a_servo_may_be_held_for_much_longer_than_a_lease(store: Store) -> None:
+    store.put([window()])
+    store.hold("a", 200.0 + LONGEST_HOLD_S)
+    assert claim(store, now=199.0 + LONGEST_HOLD_S, lease_s=1.0) == claim(store, now=200.0, lease_s=1.0) == []
+    assert len(claim(store, now=200.0 + LONGEST_HOLD_S, lease_s=1.0)) == 1
 
 
 def test_the_second_of_two_results_of_one_lease_is_void(store: Store) -> None:
