@@ -6,6 +6,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.runtime.sqlite_damage import damage_words
+from servotwin.store.claims import LOST_ANSWERS, alarm_row
 from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
 from servotwin.store.integrity import STORED_BODIES, body_fault
 from servotwin.store.migrate import VERSIONS, checked_revision
@@ -30,6 +32,10 @@ _SERIAL_MARGIN = 1_000_000
 """Upper bound of the messages to one edge that may have been posted since a backup."""
 _OF_READING = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_IOERR_READ, sqlite3.SQLITE_IOERR_SHORT_READ)
 """Errors of a copy that are of its source, as damage is: only there may another process be at work."""
+
+_ADD_ALARM = (
+    "INSERT INTO evidence (servo, kind, status, created, body) VALUES (:servo, :kind, :status, :created, :body)"
+)
 
 Progress = Callable[[int, int], None]
 """(pages that remain, pages in all)."""
@@ -117,12 +123,15 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
 
 
 def _ask_for_windows(store: sqlite3.Connection) -> None:
-    reason = "the twin's store was restored from a backup"
-    rows = [
-        (servo, serial, encode(Resend(servo, reason=reason)), time.time())
-        for servo, serial in store.execute("SELECT servo, posted FROM twins").fetchall()
-    ]
+    """Ask every edge for the windows that it still keeps, and note the hole in the evidence of its servo."""
+    reason, now = "the twin's store was restored from a backup", time.time()
+    known = store.execute("SELECT servo, posted FROM twins").fetchall()
+    rows = [(servo, serial, encode(Resend(servo, reason=reason)), now) for servo, serial in known]
     store.executemany("INSERT INTO outgoing (servo, serial, body, created) VALUES (?, ?, ?, ?)", rows)
+    last = store.execute("SELECT received FROM messages ORDER BY id DESC LIMIT 1").fetchone()
+    backed_up = "" if last is None else datetime.fromtimestamp(last[0], UTC).strftime(" whose newest message came on %Y-%m-%d %H:%M:%S UTC")
+    alarms = [alarm_row(servo, f"{reason}{backed_up}. {LOST_ANSWERS}", now) for servo, _ in known]
+    store.executemany(_ADD_ALARM, alarms)
 
 
 def _existing(url: str, to: Path) -> Path:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Collection
+from typing import Any, NamedTuple
 
 import msgspec
 import sqlalchemy as sa
@@ -19,6 +20,11 @@ class StoredClaim(NamedTuple):
 
 
 NO_CLAIM = StoredClaim("", 0)
+LOST_ANSWERS = (
+    "Versions that were sent since, and the edge's answers to them, are missing in this record; the edge is asked for "
+    "the windows that it keeps"
+)
+"""Sentence for the record of a servo whose store was put back."""
 
 
 def claim_of(connection: sa.Connection, servo: str) -> StoredClaim:
@@ -36,9 +42,14 @@ def raise_claim(connection: sa.Connection, servo: str, new: StoredClaim, below: 
     return claim_of(connection, servo)
 
 
-def add_alarm(connection: sa.Connection, servo: str, sentence: str, now: float) -> None:
-    """Store an alarm about a servo's edge as evidence without a window."""
-    connection.execute(insert_once(connection.dialect.name, twins), {"servo": servo})
+def add_alarm(connection: sa.Connection, servos: Collection[str], sentence: str, now: float) -> None:
+    """Store an alarm about each of some servos as evidence without a window."""
+    if servos:
+        connection.execute(insert_once(connection.dialect.name, twins), [{"servo": servo} for servo in sorted(servos)])
+        connection.execute(sa.insert(evidence), [alarm_row(servo, sentence, now) for servo in sorted(servos)])
+
+
+def alarm_row(servo: str, sentence: str, now: float) -> dict[str, Any]:
+    """Row of the evidence for an alarm."""
     body = msgspec.msgpack.encode({"sentence": sentence})
-    row = {"servo": servo, "kind": "alarm", "status": sentence, "created": now, "body": body}
-    connection.execute(sa.insert(evidence), row)
+    return {"servo": servo, "kind": "alarm", "status": sentence, "created": now, "body": body}

@@ -47,9 +47,7 @@ def acquire(
     """
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     late = now + 2.0 * max(until - now, LONGEST_HOLD_S)
-    bound = {"_now": now, "_late": late, "_ahead": _ahead(now)} | (
-        {} if only is None else {"_only": only}
-    )
+    bound = {"_now": now, "_late": late, "_ahead": _ahead(now)} | ({} if only is None else {"_only": only})
     new, estimates, backlogs = _queues(frozenset(kinds), only is not None)
     order = [(new, limit, False), (estimates, 1, True), (backlogs, limit, False)]
     for queues, most, estimate in [order[1], *order] if estimate_first else order:

@@ -187,9 +187,9 @@ class Store:
         """Store a claim where the servo's newest has a number below `below`; return the one that counts then."""
         return self._write(lambda connection: raise_claim(connection, servo, new, below, now))
 
-    def add_alarm(self, servo: str, sentence: str, now: float) -> None:
-        """Store an alarm about a servo's edge, which belongs to no window."""
-        self._write(lambda connection: add_alarm(connection, servo, sentence, now))
+    def add_alarm(self, sentence: str, now: float, *servos: str) -> None:
+        """Store an alarm about each of some servos, which belongs to no window."""
+        self._write(lambda connection: add_alarm(connection, servos, sentence, now))
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""

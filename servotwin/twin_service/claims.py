@@ -152,7 +152,7 @@ class EdgeClaims:
     async def _tell_conflict(self, servo: str, what: str) -> None:
         sentence = f"conflict: {what}"
         self._announce("conflict", sentence, servo)
-        await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        await self._write(servo, lambda now: self._store.add_alarm(sentence, now, servo))
         self._metrics.evidence.add(_KIND)
 
     async def _take(self, servo: str, new: StoredClaim, before: StoredClaim) -> StoredClaim:
@@ -172,7 +172,7 @@ class EdgeClaims:
         self._announce("conflict", sentence, servo)
         if (servo, claim.run) in self._reported:
             return
-        await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        await self._write(servo, lambda now: self._store.add_alarm(sentence, now, servo))
         self._metrics.evidence.add(_KIND)
         self._reported[servo, claim.run] = None
         if len(self._reported) > MAX_SERVOS:
@@ -186,7 +186,7 @@ class EdgeClaims:
             "older folder was put back, or a copy started; what waited for the twin in the other one is not in it"
         )
         self._announce("folder behind", sentence, servo)
-        await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        await self._write(servo, lambda now: self._store.add_alarm(sentence, now, servo))
         self._metrics.evidence.add(_KIND)
 
     async def _newest(self, servo: str) -> StoredClaim:

@@ -329,8 +329,9 @@ class Dispatcher:
     async def _hold(self, servo: str, seconds: float) -> None:
         """Let the other servos come first after one that took long."""
         if hold := self._pace.hold(seconds):
+            until = self._clocks.wall() + min(hold, LONGEST_HOLD_S)
             with suppress(StoreUnavailable):
-                await self._executor.run(partial(self._store.hold, servo, self._clocks.wall() + min(hold, LONGEST_HOLD_S)))
+                await self._executor.run(partial(self._store.hold, servo, until))
 
     async def _committed(self, result: WorkResult) -> bool:
         counts = self._metrics.results

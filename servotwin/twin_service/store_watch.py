@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
+from servotwin.store.claims import LOST_ANSWERS
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.integrity import (
     IntegrityReport,
@@ -252,10 +253,10 @@ class StoreWatch:
         log.error("the store has lost messages", extra={"servo": servo, "had": after, "has": posted})
         sentence = (
             f"the edge has had message {after}, and the newest one of the store is {posted}: the store was put back, "
-            "or is another one; the edge is asked for the windows that it keeps"
+            f"or is another one. {LOST_ANSWERS}"
         )
         now = self._wall()
-        self._store.add_alarm(servo, sentence, now)
+        self._store.add_alarm(sentence, now, servo)
         self._store.post({servo: encode(Resend(servo, reason=_LOST))}, now, above=max(after, fresh_serial(now)))
         return self._store.outgoing(servo, after), sentence
 
@@ -287,8 +288,12 @@ class StoreWatch:
         self._ask_for_windows()
 
     def _ask_for_windows(self) -> set[str]:
-        """Ask those edges for the windows that they still keep that were not asked yet; return them."""
+        """Ask those edges for the windows that they still keep that were not asked yet; return them.
+
+        The hole in the evidence is said there: nothing else shows what the edges do not send again.
+        """
         new, now = self._servos() - self._asked, self._wall()
+        self._store.add_alarm(f"the store has lost messages: {self.lost}. {LOST_ANSWERS}", now, *new)
         asked = {servo: encode(Resend(servo, reason=_LOST)) for servo in new}
         self._store.post(asked, now, above=fresh_serial(now))  # edges ignore serials up to the last one that they got
         self._asked |= new

@@ -311,7 +311,7 @@ def test_nothing_moves_while_alarms_and_updates_come_and_the_twin_goes(open_page
     try:
         for place in (".alarms", "[aria-label=Updates]", "[aria-label=Oversight]", "[aria-label=Events]"):
             page.locator(place).first.evaluate("place => place.scrollIntoView({ block: 'start' })")
-            store.add_alarm(WEARING, f"the alarm at {place} {MARKUP}", time.time())
+            store.add_alarm(f"the alarm at {place} {MARKUP}", time.time(), WEARING)
             has_text(page, ".alarms li", f"the alarm at {place}")
             has_text(page, "[aria-label=Events] td", f"the alarm at {place}")
     finally:

@@ -53,6 +53,13 @@ def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     assert [update] == store.outgoing("a", 0)
     # An edge is asked for the windows that came after the backup.
     assert decode(asking.body) == Resend("a", reason="the twin's store was restored from a backup")
+    # What comes no more, the answers to later versions, is said where somebody would look for it.
+    (alarm,) = restored.events("a")
+    assert (alarm.kind, store.events("a")) == ("alarm", [])
+    assert alarm.status.startswith(
+        "the twin's store was restored from a backup whose newest message came on 1970-01-01 00:01:44 UTC. Versions"
+    )
+    assert "the edge's answers to them, are missing" in alarm.status
     assert restored.window("a", "boot", 3) == store.window("a", "boot", 3)
     (summary,) = restored.servos()
     assert summary.posted > store.servos()[0].posted + 100_000

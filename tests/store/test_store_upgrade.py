@@ -124,7 +124,7 @@ def test_of_claims_only_a_higher_number_counts(new_address: NewAddress) -> None:
     assert store.raise_claim("x", StoredClaim("two", 3), 3, 2.0) == StoredClaim("one", 3)
     assert store.raise_claim("x", StoredClaim("two", 4), 4, 3.0) == StoredClaim("two", 4)
     assert store.claim_of("y") == NO_CLAIM
-    store.add_alarm("new", "conflict: two edges", 5.0)
+    store.add_alarm("conflict: two edges", 5.0, "new")
     assert [(one.kind, one.status, one.created) for one in store.events("new")] == [
         ("alarm", "conflict: two edges", 5.0)
     ]
@@ -140,6 +140,7 @@ def test_a_backup_of_the_revision_before_is_made_and_restored_by_this_version(tm
     store = open_store(other)
     assert revision(store) == REVISION
     after = rows(store)
+    del after["evidence"][len(before["evidence"]) :]  # an alarm: the backup lacks what came later
     assert {name: after[name] for name in ("messages", "bodies", "evidence")} == {
         name: before[name] for name in ("messages", "bodies", "evidence")
     }

@@ -212,6 +212,9 @@ def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_p
 
     async def look(system, _client):
         assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+        (alarm,) = system.store.events("ax-1")
+        assert alarm.status.startswith("the store has lost messages: its newest message is number 2, and it once had")
+        assert "the edge's answers to them, are missing" in alarm.status
 
     serve(path, look)
     (line,) = (record for record in caplog.records if record.message == "the store has lost messages")
