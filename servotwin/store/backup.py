@@ -129,7 +129,11 @@ def _ask_for_windows(store: sqlite3.Connection) -> None:
     rows = [(servo, serial, encode(Resend(servo, reason=reason)), now) for servo, serial in known]
     store.executemany("INSERT INTO outgoing (servo, serial, body, created) VALUES (?, ?, ?, ?)", rows)
     last = store.execute("SELECT received FROM messages ORDER BY id DESC LIMIT 1").fetchone()
-    backed_up = "" if last is None else datetime.fromtimestamp(last[0], UTC).strftime(" whose newest message came on %Y-%m-%d %H:%M:%S UTC")
+    backed_up = (
+        ""
+        if last is None
+        else datetime.fromtimestamp(last[0], UTC).strftime(" whose newest message came on %Y-%m-%d %H:%M:%S UTC")
+    )
     alarms = [alarm_row(servo, f"{reason}{backed_up}. {LOST_ANSWERS}", now) for servo, _ in known]
     store.executemany(_ADD_ALARM, alarms)
 

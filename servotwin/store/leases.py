@@ -7,7 +7,7 @@ windows that a glance was not enough for, then backlogs.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -97,14 +97,21 @@ def _taken_alone(
 
 def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
     """End an owner's leases: all of them, or those of some servos."""
-    ending = sa.update(twins).where(twins.c.lease_owner == owner).values(lease_owner=None, lease_until=None)
-    connection.execute(ending if servos is None else ending.where(twins.c.servo.in_(servos)))
+    if servos is None:
+        servos = connection.scalars(sa.select(twins.c.servo).where(twins.c.lease_owner == owner)).all()
+    _CHANGE.run(connection, _changes(owner, servos, None, None))
 
 
 def renew(connection: sa.Connection, owner: str, servos: Collection[str], until: float) -> None:
     """Extend an owner's leases of some servos; those that it has lost stay lost."""
-    mine = sa.update(twins).where(twins.c.lease_owner == owner, twins.c.servo.in_(servos))
-    connection.execute(mine.values(lease_until=until))
+    _CHANGE.run(connection, _changes(owner, servos, owner, until))
+
+
+def _changes(
+    owner: str, servos: Collection[str], new_owner: str | None, until: float | None
+) -> Iterator[dict[str, Any]]:
+    """Rows of the changed leases, in the order in which every transaction locks servos: others wait for them too."""
+    return ({"_servo": servo, "_owner": owner, "_new": new_owner, "_until": until} for servo in sorted(servos))
 
 
 def hold(connection: sa.Connection, servo: str, until: float) -> None:
@@ -246,6 +253,13 @@ _LEASE = RowStatement(
             lease_until=sa.bindparam("_until", type_=sa.Double),
             attempts=twins.c.attempts + 1,
         )
+    )
+)
+_CHANGE = RowStatement(
+    lambda _: (
+        sa.update(twins)
+        .where(twins.c.servo == sa.bindparam("_servo"), twins.c.lease_owner == sa.bindparam("_owner"))
+        .values(lease_owner=sa.bindparam("_new"), lease_until=sa.bindparam("_until", type_=sa.Double))
     )
 )
 _STATES = (
