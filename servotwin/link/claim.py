@@ -14,6 +14,7 @@ from typing import Protocol
 
 from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
+from servotwin.messages.checks import LARGEST_REPORTED
 from servotwin.messages.claims import CLONED
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
@@ -70,7 +71,7 @@ class HeldClaim:
         number, _, run = text.partition(" ")
         if not (number.isascii() and number.isdecimal() and len(number) <= 16 and run):
             return None
-        return HeldClaim(run, int(number))
+        return HeldClaim(run, int(number)) if int(number) <= LARGEST_REPORTED else None
 
 
 @dataclass(frozen=True, slots=True)

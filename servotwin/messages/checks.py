@@ -11,6 +11,9 @@ NAME_PATTERN = r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"
 Name = Annotated[str, Meta(pattern=NAME_PATTERN)]
 Text = Annotated[str, Meta(max_length=256)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
+LARGEST_REPORTED = 2**52
+"""Largest number that an edge may report and the twin counts on from: half a count, so that what follows is one too."""
+Reported = Annotated[int, Meta(ge=0, le=LARGEST_REPORTED)]
 
 
 class Refusal(StrEnum):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from servotwin.messages.checks import Count, Name, Text, require
+from servotwin.messages.checks import Count, Name, Reported, Text, require
 
 PROBE, TEACHING = "probe", "teaching"
 """Reasons of the windows of a probing move: there and back, and to several places, in moves of different lengths."""
@@ -149,7 +149,7 @@ class Answer(Struct, frozen=True, tag="answer/1"):
     serial: Count
     sample: Count
     outcome: RequestOutcome
-    newest: Count
+    newest: Reported
 
     @property
     def accepted(self) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from servotwin.messages.checks import Count, Name, Text, all_finite, require
+from servotwin.messages.checks import Count, Name, Reported, Text, all_finite, require
 from servotwin.messages.setting import Gains, Setting
 
 
@@ -185,7 +185,7 @@ class Receipt(Struct, frozen=True, omit_defaults=True, tag="receipt/1"):
     applied: bool
     sample: Count
     reason: Reason
-    parameter_version: Count
+    parameter_version: Reported
     boot: Name
     detail: Annotated[str, Meta(max_length=256, pattern=r"\A[ -~]*\Z")] = ""
 
@@ -215,7 +215,7 @@ class Fallback(Struct, frozen=True, tag="fallback/2"):
     measured: float
     allowed: float
     replaced: Count
-    parameter_version: Count
+    parameter_version: Reported
     setting: Setting
 
     def __post_init__(self) -> None:

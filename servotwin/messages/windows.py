@@ -10,7 +10,7 @@ from zlib import crc32
 
 from msgspec import Meta, Struct
 
-from servotwin.messages.checks import Count, InvalidMessage, Name, Text, all_finite, require
+from servotwin.messages.checks import Count, InvalidMessage, Name, Reported, Text, all_finite, require
 from servotwin.messages.setting import Setting
 
 FINE = "_fine"
@@ -143,7 +143,7 @@ class WindowMessage(Struct, frozen=True, omit_defaults=True, tag="window/1"):
     rate: float
     channels: Annotated[tuple[Channel, ...], Meta(min_length=1, max_length=32)]
     reference_changes: Annotated[tuple[tuple[float, float], ...], Meta(max_length=4096)]
-    parameter_version: Count
+    parameter_version: Reported
     model_version: Text
     reason: Text
     crc: Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
@@ -201,7 +201,7 @@ class Hello(Struct, frozen=True, tag="hello/2"):
     boot: Name
     time: float
     rate: float
-    parameter_version: Count
+    parameter_version: Reported
     setting: Setting
     model_version: Text
     protocol: Count = 1

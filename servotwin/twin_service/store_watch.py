@@ -13,6 +13,7 @@ from threading import Event
 from typing import TypeVar
 
 from servotwin.messages import Resend, encode
+from servotwin.messages.checks import LARGEST_REPORTED
 from servotwin.runtime.files import replace_file
 from servotwin.store.claims import LOST_ANSWERS
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, parse_address, sqlite_file
@@ -51,7 +52,7 @@ _NEW_S = 10.0
 """s between two looks for servos that are new to a store that has lost messages."""
 _AHEAD_S = 3600.0
 """s for which an edge that has had more than the store sent is not asked once more."""
-_MAX_SERIAL = 2**52
+_MAX_SERIAL = LARGEST_REPORTED
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _MARK = "newest"
 _LOST = "the twin's store has lost messages"
