@@ -7,6 +7,7 @@ whether it still is, which the twin reports as a conflict. `servotwin.messages.c
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Lock
@@ -14,7 +15,7 @@ from typing import Protocol
 
 from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
-from servotwin.messages.checks import LARGEST_REPORTED
+from servotwin.messages.checks import LARGEST_REPORTED, NAME_PATTERN
 from servotwin.messages.claims import CLONED
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
@@ -69,7 +70,7 @@ class HeldClaim:
     def from_text(text: str) -> HeldClaim | None:
         """Read a claim as `text` writes it; None: it is none."""
         number, _, run = text.partition(" ")
-        if not (number.isascii() and number.isdecimal() and len(number) <= 16 and run):
+        if not (number.isascii() and number.isdecimal() and len(number) <= 16 and re.match(NAME_PATTERN, run)):
             return None
         return HeldClaim(run, int(number)) if int(number) <= LARGEST_REPORTED else None
 

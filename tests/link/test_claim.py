@@ -220,7 +220,10 @@ def test_what_an_older_twin_does_not_understand_is_kept(protocol: int | None, ke
     assert one._transport.sent == (1 if kept else 0)
 
 
-@pytest.mark.parametrize("text", ["", "7", "x b1", "-1 b1", "1 ", "99999999999999999999 b1"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "7", "x b1", "-1 b1", "1 ", "99999999999999999999 b1", f"{2**52 + 1} b1", "1 b\0", "1 b b", f"1 {'b' * 65}"],
+)
 def test_a_text_that_is_no_claim_is_none(text: str) -> None:
     assert HeldClaim.from_text(text) is None
     assert HeldClaim.from_text(HeldClaim("b1-aa", 7).text) == HeldClaim("b1-aa", 7)
