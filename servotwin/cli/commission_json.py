@@ -127,5 +127,7 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
         "doubts": list(drive.doubts),
         "late": drive.late or None,
         "elastic": drive.elastic or None,
+        "slip": drive.slip or None,
+        "tight_spot": drive.tight or None,
         "next_experiment": str(drive.advice),
     }

@@ -14,13 +14,24 @@ from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
 from servotwin.estimation.inverse_dynamics.command_delay import NEAR, CommandDelay, delay_remark, fitted_delay
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
-from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
+from servotwin.estimation.inverse_dynamics.fit import (
+    ASYMMETRIC,
+    SYMMETRIC,
+    ParameterFit,
+    cycle_time,
+    fit_models,
+    joined,
+    rows_of,
+    widened,
+)
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
 from servotwin.estimation.inverse_dynamics.hidden_shaft import HiddenShaft, hidden_shaft
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
+from servotwin.estimation.inverse_dynamics.slip import BeltSlip, belt_slip
+from servotwin.estimation.inverse_dynamics.tight_spot import tight_spot
 
 GivenLaw = GivenGains | GivenPid
 # Of the ways of reference and position: a loop that follows is within.
@@ -61,6 +72,10 @@ class IdentifiedDrive:
         By how much the command moves the drive at another time than it was logged; empty: it does not for sure.
     elastic : str
         Elasticity that the motor's encoder shows and the axis does not have; empty: none for sure.
+    slip : str
+        Slip of the load against the motor; empty: no load encoder, or none for sure.
+    tight : str
+        Part of the travel with more friction, in the first recording; empty: none for sure.
     """
 
     symmetric: ParameterFit
@@ -74,6 +89,8 @@ class IdentifiedDrive:
     split: ParameterFit | None = None
     late: str = ""
     elastic: str = ""
+    slip: str = ""
+    tight: str = ""
 
 
 def identify_drive(
@@ -128,7 +145,11 @@ def identify_drive(
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
     hidden = hidden_shaft(used, motions, bands, late)
     found = found.with_shaft(hidden, late)
-    shaft = shaft_response(used[0])
+    slip = belt_slip(used, motions, bands)
+    found = found.with_slip(slip)
+    spot = None if slip is not None else tight_spot(used[0], motions[0], bands[0])
+    # What slips is neither late nor elastic.
+    shaft = None if slip is not None else shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
     return IdentifiedDrive(
         found.symmetric,
@@ -141,7 +162,9 @@ def identify_drive(
         shaft,
         split,
         words,
-        "" if hidden is None or split is not None else hidden.remark(used[0].load is not None),
+        "" if hidden is None or slip is not None or split is not None else hidden.remark(used[0].load is not None),
+        "" if slip is None else slip.remark(used[0].unit),
+        "" if spot is None else spot.remark(used[0].unit),
     )
 
 
@@ -187,6 +210,17 @@ class _Fits:
         if not hidden.sure:  # what it does beside a delay that is not sure either
             symmetric = replace(symmetric, values=self.symmetric.values + symmetric.values - late.symmetric.values)
             asymmetric = replace(asymmetric, values=self.asymmetric.values + asymmetric.values - late.asymmetric.values)
+        return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
+
+    def with_slip(self, slip: BeltSlip | None) -> _Fits:
+        """These, their intervals with what slip between motor and load does."""
+        if slip is None:
+            return self
+        symmetric, asymmetric = slip.symmetric.only(SYMMETRIC), slip.asymmetric.only(ASYMMETRIC)
+        refined = self.refinement
+        if refined is not None:
+            both = widened(refined.symmetric, symmetric), widened(refined.asymmetric, asymmetric)
+            refined = replace(refined, symmetric=both[0], asymmetric=both[1])
         return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
 
 
