@@ -8,8 +8,8 @@ before that filter.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import signal
@@ -29,6 +29,8 @@ _EDGE = 2.0  # periods of the corner that a filter needs to forget the ends
 _REST = 2.0  # periods of the corner: a longer standstill is no reversal
 _SEGMENTS = 8  # of a spectrum's average
 _KEPT = 0.99  # share of usable samples below a row's filter
+LONGEST = 2**18
+"""Samples of a log that are fitted with many regressors at once."""
 
 
 class RegressionBand(NamedTuple):
@@ -111,6 +113,23 @@ def motion_of(position: Array, rate: float, band: RegressionBand) -> DriveMotion
     slow = max(slow, 1e-4 * float(np.abs(speed).max()))
     resting = _long(np.abs(speed) < slow, _REST * rate / band.corner)
     return DriveMotion(speed, np.gradient(speed, 1.0 / rate), side, resting, rate)
+
+
+def busiest(recording: DriveRecording, motion: DriveMotion) -> tuple[DriveRecording, DriveMotion]:
+    """The stretch of at most `LONGEST` samples with most motion: many regressors of a long log fill the memory."""
+    size = recording.position.size
+    if size <= LONGEST:
+        return recording, motion
+    moved = np.concatenate([[0], np.cumsum(~motion.resting)])
+    begin = int(np.argmax(moved[LONGEST:] - moved[:-LONGEST]))
+
+    def cut(values: Any) -> Any:
+        return values[begin : begin + LONGEST] if isinstance(values, np.ndarray) and values.size == size else values
+
+    return (
+        replace(recording, **{each.name: cut(getattr(recording, each.name)) for each in fields(recording)}),
+        replace(motion, **{each.name: cut(getattr(motion, each.name)) for each in fields(motion)}),
+    )
 
 
 def filtered_rows(

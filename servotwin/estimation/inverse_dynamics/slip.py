@@ -11,7 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, filtered_rows, motion_of
+from servotwin.estimation.inverse_dynamics.conditioning import (
+    DriveMotion,
+    RegressionBand,
+    busiest,
+    filtered_rows,
+    motion_of,
+)
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.plant.signals import Array
@@ -58,7 +64,7 @@ def belt_slip(
     """The slip that the first recording shows; None: no load encoder, or none for sure."""
     if recordings[0].load is None:
         return None
-    size, share = _added_up(recordings[0], motions[0], bands[0])
+    size, share = _added_up(*busiest(recordings[0], motions[0]), bands[0])
     counts = max(recordings[0].resolution, recordings[0].load_resolution)
     if not (share > _EXPLAINS and size > _COUNTS * counts):
         return None

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand
+from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, busiest
 from servotwin.estimation.inverse_dynamics.fit import cycle_time, rows_of
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.plant.signals import Array
@@ -35,12 +36,17 @@ class TightSpot(NamedTuple):
 
 def tight_spot(recording: DriveRecording, motion: DriveMotion, band: RegressionBand) -> TightSpot | None:
     """Fit Coulomb friction and a constant force in each part of the travel; None: no part stands out for sure."""
+    recording, motion = busiest(recording, motion)
     place, side = recording.position, np.where(motion.resting, 0.0, motion.side)
     edges = np.linspace(place.min(), place.max(), _PARTS + 1)
     part = np.clip(np.searchsorted(edges, place) - 1, 0, _PARTS - 1)
     there = (part[:, None] == np.arange(_PARTS)).astype(float)
     # A force that depends on the place alone, as cogging does, is no friction.
-    rows = rows_of(recording, motion, band, cycle_time(motion), np.column_stack([there * side[:, None], there]))
+    try:
+        rows = rows_of(recording, motion, band, cycle_time(motion), np.column_stack([there * side[:, None], there]))
+    except InvalidInput:
+        # Of a long log with little motion the stretch may have too few moments of it.
+        return None
     design = np.column_stack([rows.design[:, :_OWN], rows.extra])
     friction = _friction(design, rows.force)
     without = [

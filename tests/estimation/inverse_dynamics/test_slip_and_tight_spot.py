@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from drive_recordings import recording_of, strokes
 
+from servotwin.estimation.inverse_dynamics import conditioning
+from servotwin.estimation.inverse_dynamics.conditioning import band_of, busiest, motion_of
 from servotwin.estimation.inverse_dynamics.identify import identify_drive
 
 RATE, PARTS = 500.0, 20  # steps in a sample
@@ -86,3 +88,16 @@ def test_a_tight_spot_is_told_with_its_place_and_size(begin, end, more):
 @pytest.mark.parametrize("even", [{}, {"noise": 1e-6}])
 def test_even_friction_has_no_tight_spot(even):
     assert identify_drive([recorded(**even, two=False)]).tight == ""
+
+
+def test_of_a_long_log_the_stretch_with_most_motion_is_looked_at(monkeypatch):
+    position = np.concatenate([np.zeros(5000), strokes(cycles=1), np.zeros(3000)])
+    recording = recording_of(position, np.zeros(position.size))
+    band = band_of(recording)
+    motion = motion_of(position, recording.rate, band)
+    assert busiest(recording, motion) == (recording, motion)
+    monkeypatch.setattr(conditioning, "LONGEST", position.size - 6000)
+    stretch, moved = busiest(recording, motion)
+    assert stretch.position.size == moved.speed.size == position.size - 6000
+    assert np.ptp(stretch.position) == np.ptp(position)
+    assert stretch.duration == pytest.approx(stretch.position.size / recording.rate)
