@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from servotwin.cli.gap_options import GapForm, stated_gap
+from servotwin.cli.identify_windows import Followed, Report, followed
 from servotwin.cli.log_controller import controller_remarks
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side
@@ -18,7 +19,6 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import default_method, is_motors_position, settings_of
 from servotwin.estimation.late_window import samples_late
 from servotwin.estimation.learning.trend import Trend, TrendSettings
-from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.estimation.window import Window
@@ -29,13 +29,11 @@ from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant, plant_of, resolve_plant
 from servotwin.plant.scales import scales
 from servotwin.plant.sensors import LOAD
-from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 WINDOW = 1.0  # s of the servo's own
 _WEAR = 40.0  # windows in which the gap of an axis grows by itself, where the log is shorter
 _FREE = 8.0  # windows: a load behind a free shaft needs so much longer to come to rest
-Report: TypeAlias = Callable[[int, int], None]
 
 
 def _silent(_done: int, _total: int) -> None:
@@ -110,44 +108,21 @@ def identify(options: IdentifyOptions, progress: Report = _silent) -> Identifica
     stated = _settings(options, servo, _known_of_gap(seen))
     settings, windows = stated.on(servo), cut(log, options, servo)
     if isinstance(servo, Axis) and options.wear_over_s is None:
-        followed = _followed_without_wear(log, windows, seen, settings, progress)
+        found = _followed_without_wear(log, windows, seen, settings, progress)
     else:
-        followed = _followed(windows, seen, settings, progress)
-    trend = followed.trend
+        found = followed(windows, seen, settings, progress)
+    trend = found.trend
     if seen is servo and not servo.at_motor:
         added = controller_remarks(windows, servo.controller)
-        remarks = tuple(mine + more for mine, more in zip(followed.remarks, added, strict=True))
-        followed = followed._replace(remarks=remarks)
+        remarks = tuple(mine + more for mine, more in zip(found.remarks, added, strict=True))
+        found = found._replace(remarks=remarks)
     until = None if settings.gap_limit is None or trend is None else trend.time_until(settings.gap_limit)
-    return Identification(servo, windows, *followed, until)
-
-
-class _Followed(NamedTuple):
-    """Estimates of windows in the order of time, remarks on each, and the trend after the last one."""
-
-    estimates: tuple[GapEstimate, ...]
-    remarks: tuple[tuple[str, ...], ...]
-    trend: Trend | None
-
-
-def _followed(windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report) -> _Followed:
-    wear, estimator = Wear(settings.initial_gap), estimator_of(seen, settings)
-    trends, learning = settings.trend, settings.learning
-    estimates, remarks = list[GapEstimate](), list[tuple[str, ...]]()
-    for done, window in enumerate(windows):
-        progress(done, len(windows))
-        now, before = window.mid_time, wear
-        estimate = estimator(window, wear.expect(trends, "log", now, now, learning))
-        wear, rejection = wear.update(trends, "log", estimate, now, learning)
-        outlier = [rejection] if estimate.ok and rejection else []
-        estimates.append(estimate)
-        remarks.append((*outlier, *wear.remarks(before, estimate, trends, learning)))
-    return _Followed(tuple(estimates), tuple(remarks), wear.trend(trends))
+    return Identification(servo, windows, *found, until)
 
 
 def _followed_without_wear(
     log: Log, windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report
-) -> _Followed:
+) -> Followed:
     """The same of an axis of which nobody states the wear: it grows by what the log shows, and by itself in 40 windows.
 
     The wear decides which windows are accepted, and these show the wear: they are estimated again until both agree.
@@ -156,10 +131,10 @@ def _followed_without_wear(
     share = min(1.0, over / (_WEAR * windows[0].duration))
     trend = TrendSettings(rate_std_rad_per_s=0.0, rate_walk_rad_per_s_per_sqrt_s=0.0, **known)
     while True:
-        followed = _followed(windows, seen, replace(settings, trend=trend), progress)
-        shown = _growth([estimate for estimate in followed.estimates if estimate.ok], share)
+        found = followed(windows, seen, replace(settings, trend=trend), progress)
+        shown = _growth([estimate for estimate in found.estimates if estimate.ok], share)
         if shown <= 2.0 * growth:
-            return followed
+            return found
         growth = shown
         trend = TrendSettings.for_wear(growth, over, **known)
 
