@@ -20,6 +20,7 @@ from servotwin.messages import (
     decode,
     encode,
 )
+from servotwin.messages.checks import LARGEST_REPORTED
 
 SECONDS = st.floats(1e-3, 9.0)
 ASKS = st.one_of(
@@ -45,7 +46,7 @@ def test_requests_survive_the_bytes(
     assert len(encode(request)) < 1500
 
 
-@given(NAMES, NAMES, COUNTS, COUNTS, st.sampled_from(RequestOutcome), COUNTS)
+@given(NAMES, NAMES, COUNTS, COUNTS, st.sampled_from(RequestOutcome), st.integers(1, LARGEST_REPORTED))
 def test_answers_survive_the_bytes(
     servo: str, boot: str, serial: int, sample: int, outcome: RequestOutcome, newest: int
 ) -> None:
