@@ -115,9 +115,10 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         raise InvalidInput(
             f"log {path}: its columns {', '.join(chosen.values())} have different lengths: one table is needed"
         )
-    parts = {part: divided_unit(_unit(path, part, chosen, wanted)) for part in chosen}
-    units = {part: unit for part, (unit, _) in parts.items()}
-    arrays = {part: values / parts[part][1] for part, values in arrays.items()}
+    units = {part: _unit(path, part, chosen, wanted) for part in chosen}
+    for part in {"motor", "load", "reference"}.intersection(arrays):
+        units[part], parts = divided_unit(path, units[part])
+        arrays[part] = arrays[part] / parts
     clock = LogClock(path, units.get("time", ""), wanted.rate)
     size = sizes.pop()
     time = clock.seconds(arrays.pop("time", None), size)
@@ -283,7 +284,7 @@ def _unit(path: Path, part: str, chosen: Mapping[str, str], wanted: DriveColumns
         return unit
     if not unit and part == "reference":
         return _unit(path, "load" if "load" in chosen else "motor", chosen, wanted)
-    if divided_unit(unit)[0] not in _POSITIONS:
+    if divided_unit(path, unit)[0] not in _POSITIONS:
         shown = f"is in {unit!r}" if unit else "does not say its unit"
         raise InvalidInput(
             f"log {path}: column {chosen[part]!r} {shown}: give --{part}-unit, one of {', '.join(_POSITIONS)}, or "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ _ALIASES: Mapping[str, str] = {
     **{unit: unit for unit in ("deg", "rad", "mrad", "rev", "mm", "µm", "um", "ms")},
 }
 _KNOWN = {*ANGLES, *LENGTHS, "s", "sec", "ms", "us", "µs", "ns", "min", "h"}
-_PART = re.compile(r"^(?P<unit>\D.*?)\s*/\s*(?P<parts>\d+(\.\d+)?)$")
+_PART = re.compile(r"^(?P<unit>\D.*?)\s*/\s*(?P<parts>[-+.\d].*|)$")
 _BEHIND_COMMA = re.compile(r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>[^\s,/\d]+|N m)\s*$")
 _COMMANDS = ("V", "A", "N", "N m", "Nm")
 
@@ -89,11 +90,24 @@ def known_unit(unit: str) -> str:
     return bare if bare in _KNOWN else _ALIASES.get(bare.lower(), bare)
 
 
-def divided_unit(unit: str) -> tuple[str, float]:
-    """A unit and by what it is divided: of `rev/4096`, counts of an encoder with 4096 in a turn, `rev` and 4096."""
+def divided_unit(path: Path, unit: str) -> tuple[str, float]:
+    """A unit and by what it is divided: of `rev/4096`, counts of an encoder with 4096 in a turn, `rev` and 4096.
+
+    Raises
+    ------
+    InvalidInput
+        It is divided by no positive number.
+    """
     found = _PART.match(unit)
-    parts = float(found["parts"]) if found else 0.0
-    return (known_unit(found["unit"]), parts) if found and parts > 0.0 else (unit, 1.0)
+    if not found:
+        return unit, 1.0
+    try:
+        parts = float(found["parts"])
+    except ValueError:
+        parts = math.nan
+    if not 0.0 < parts < math.inf:
+        raise InvalidInput(f"log {path}: unit {unit!r}: must be divided by a number above 0, such as rev/4096")
+    return known_unit(found["unit"]), parts
 
 
 def _parted(name: str) -> tuple[str, str]:

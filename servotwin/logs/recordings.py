@@ -107,8 +107,8 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
     if first is None:
         raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     units = {part: named_unit(name) for part, name in chosen.items()}
-    motor_unit, motor_parts = divided_unit(known_unit(wanted.motor_unit or units["motor"]) or "motor unit")
-    load_unit, load_parts = divided_unit(known_unit(wanted.load_unit or units["load"]) or "load unit")
+    motor_unit, motor_parts = divided_unit(path, known_unit(wanted.motor_unit or units["motor"]) or "motor unit")
+    load_unit, load_parts = divided_unit(path, known_unit(wanted.load_unit or units["load"]) or "load unit")
     both = {"motor": motor_unit, "load": load_unit}
     divisors = {"motor": motor_parts, "load": load_parts}
     turns = {part: 2.0 * np.pi / ANGLES[unit] for part, unit in both.items() if unit in ANGLES}

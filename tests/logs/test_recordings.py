@@ -46,6 +46,9 @@ def test_tables_of_text(tmp_path, made):
     counts = csv(tmp_path / "f.csv", values * [1.0, 4096.0, 500.0], "t [s],motor,load [mm/500]")
     parts = seen(counts, made, RecordingColumns(motor_unit="rev/4096"))
     assert (parts.recording.motor_unit, parts.recording.load_unit) == ("rev", "mm")
+    for none in ("rev/0", "rev/-5", "rev/", "rev/1,5"):
+        with pytest.raises(InvalidInput, match=rf"f\.csv: unit '{none}': must be divided by a number above 0"):
+            read_recording(counts, RecordingColumns(motor_unit=none))
     bare = tmp_path / "e.dat"
     np.savetxt(bare, values)
     seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))

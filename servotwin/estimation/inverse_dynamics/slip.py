@@ -113,7 +113,7 @@ def _sums(recording: DriveRecording, motion: DriveMotion) -> Array:
 
 
 def _left(design: Array, columns: Array) -> Array:
-    """What least squares with a design (r, p) leave of columns (r, c)."""
+    """Residual (r, c) of columns after least squares with a design (r, p)."""
     norm = np.linalg.norm(design, axis=0)
     scaled = design / np.where(norm > 0.0, norm, 1.0)
     return np.asarray(columns - scaled @ np.linalg.lstsq(scaled, columns, rcond=1e-10)[0])

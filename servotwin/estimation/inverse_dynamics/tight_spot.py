@@ -20,7 +20,7 @@ _OWN = 2  # inertia and viscous friction, before those of the parts
 
 
 class TightSpot(NamedTuple):
-    """Where friction is larger (m, rotary: rad), and by how much of the usual Coulomb friction."""
+    """Ends of the part with more friction (m, rotary: rad), and its excess over the usual Coulomb friction."""
 
     begin: float
     end: float
