@@ -65,10 +65,9 @@ class Noise:
 
     def source(self, rate: float, rng: np.random.Generator) -> NoiseSource:
         """A source of consecutive blocks, stationary from its first sample."""
-        sections = self.filter(rate)
-        A, B, _, _ = state_space(sections)
-        start = _square_root(_covariance(A, B)) @ rng.standard_normal(B.size)
-        return NoiseSource(self.std, sections, start.reshape(-1, 2), rng)
+        root = _start_root(Noise(1.0, (self.band[0], self.band[1]), self.kind), rate)
+        start = root @ rng.standard_normal(len(root))
+        return NoiseSource(self.std, self.filter(rate), start.reshape(-1, 2), rng)
 
     def samples(self, n: int, rate: float, rng: np.random.Generator) -> Array:
         """(n,) m, the first n samples of `source`.
@@ -93,6 +92,13 @@ def _high_pass(stop: float, passed: float, rate: float) -> Array:
     sections: Array = signal.butter(order, edge, "highpass", output="sos", fs=rate)
     sections[0, :3] /= noise_gain(sections)
     return sections
+
+
+@lru_cache(maxsize=64)
+def _start_root(noise: Noise, rate: float) -> Array:
+    """A square root of the stationary covariance of a filter's state."""
+    A, B, _, _ = state_space(noise.filter(rate))
+    return _square_root(_covariance(A, B))
 
 
 @dataclass

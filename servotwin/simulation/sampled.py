@@ -5,6 +5,7 @@ Contacts of the gap inside a sample are located.
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +39,8 @@ from servotwin.simulation.readings import TICKED_MOTOR, NoiseBuffer, PositionErr
 from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Port, TickInputs, new_output, run_ticks, shifted_output, tick_and_record
 
-_CHUNK, _LARGEST_CHUNK = 1 << 15, 1 << 16
+# Ticks of a chunk of noise, and chunks that are drawn before they are asked for.
+_FIRST_CHUNK, _CHUNK, _LARGEST_CHUNK, _DRAWN_AHEAD = 1 << 13, 1 << 15, 1 << 16, 3
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -210,19 +212,17 @@ class SampledEngine:
                 stop = min(end, self.base + _CHUNK)
                 self.flow(stop, self._inputs_until(self.base, stop))
             return
-        # The noise of the next chunk is drawn while this one runs. The first one, which is waited for, is short, and
+        # The noise of the next chunks is drawn while this one runs. The first one, which is waited for, is short, and
         # they grow slowly, so that no later one is waited for.
+        ends = _chunk_ends(self.base, end)
+        chunks = deque(zip([self.base, *ends], ends, strict=False))
         with ThreadPoolExecutor(1) as pool:
-            chunk = _CHUNK // 2
-            stop = min(end, self.base + chunk)
-            coming = pool.submit(self._inputs_until, self.base, stop)
-            while self.base < end:
-                tick_inputs, chunk = coming.result(), min(chunk + chunk // 4, _LARGEST_CHUNK)
-                following = min(end, stop + chunk)
-                if stop < end:
-                    coming = pool.submit(self._inputs_until, stop, following)
+            coming = deque(pool.submit(self._inputs_until, *chunks.popleft()) for _ in ends[:_DRAWN_AHEAD])
+            for stop in ends:
+                tick_inputs = coming.popleft().result()
+                if chunks:
+                    coming.append(pool.submit(self._inputs_until, *chunks.popleft()))
                 self.flow(stop, tick_inputs)
-                stop = following
 
     def _inputs_until(self, base: int, end: int) -> TickInputs:
         """Inputs of the ticks from one base step up to another."""
@@ -378,6 +378,15 @@ class SampledEngine:
         """Ticks per second."""
         assert self.controller.sample_rate is not None
         return self.controller.sample_rate
+
+
+def _chunk_ends(base: int, end: int) -> list[int]:
+    """Base steps at which the chunks of a run in noise end."""
+    ends, chunk = list[int](), _FIRST_CHUNK
+    while base < end:
+        base, chunk = min(end, base + chunk), min(chunk + chunk // 2, _LARGEST_CHUNK)
+        ends.append(base)
+    return ends
 
 
 def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
