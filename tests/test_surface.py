@@ -15,6 +15,7 @@ def one_line(result: object, *parts: str) -> bool:
     return "\n" not in text and len(text) < 300 and -1 not in places and places == sorted(places)
 
 
+@pytest.mark.slow
 def test_results_are_shown_in_one_line():
     servo = st.Servo.preset("paper").replace(Ki=0.0)
     tuning = st.tune(servo, 4.0, math.radians(60.0))

@@ -80,6 +80,7 @@ def test_every_preset_is_measured() -> None:
     assert set(AXES) == {*SWINGS, *CALM} == set(GAPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SWINGS)
 def test_the_describing_function_is_near_the_exact_orbit(name: str) -> None:
     (prediction,) = predictions(bare(name), gap_of(name))

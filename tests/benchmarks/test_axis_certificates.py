@@ -9,6 +9,7 @@ from benchmarks.axis_certificates import BATCH, questions
 from benchmarks.preset_machines import DUTIES
 
 
+@pytest.mark.slow
 def test_a_verified_setting_settles_beside_the_own_controller() -> None:
     units = dict(BATCH.units(("stepper-stage", "emps"), 20, 5))
     assert list(units) == [f"5/{name}/{question}" for name in ("stepper-stage", "emps") for question in questions(name)]

@@ -16,6 +16,7 @@ from servotwin.plant.axis import AXES
 ESTIMATED = tuple(name for name in DUTIES if name != "emps")
 
 
+@pytest.mark.slow
 def test_every_preset_has_a_duty_and_machines_near_it() -> None:
     assert tuple(DUTIES) == AXES
     for name in DUTIES:
@@ -33,6 +34,7 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DUTIES)
 def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
     """Windows longer than a half period overlap; one in `hold` of them may see a move."""

@@ -34,6 +34,7 @@ def test_every_defect_is_put_in_sooner_or_later() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_case_is_the_same_however_many_are_drawn_and_is_answered() -> None:
     two, three = ([each.gap for each in log_cases("telescope", count, 7)] for count in (2, 3))
     assert two == three[:2]

@@ -14,6 +14,7 @@ from servotwin.estimation.output_error import least_rate
 BATCH = BATCHES[NAME]
 
 
+@pytest.mark.slow
 def test_an_axis_depends_on_its_place_alone_and_has_enough_samples_of_a_swing() -> None:
     for block in BATCH.blocks:
         one, other = random_axis(block, 5, 0), random_axis(block, 5, 1)

@@ -212,6 +212,7 @@ def test_the_estimator_s_bench_takes_no_option_that_it_ignores():
         assert result.exit_code == 2, words
 
 
+@pytest.mark.slow
 def test_an_error_that_cannot_be_written_still_has_its_exit_code() -> None:
     """The log of a twin that starts on a full disk."""
     with Path("/dev/full").open("wb") as full:

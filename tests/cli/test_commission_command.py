@@ -49,6 +49,7 @@ def files(log):
     return names | {"json": json.loads(result.stdout)}
 
 
+@pytest.mark.slow
 def test_of_a_voltage_it_is_said_that_resistance_and_torque_constant_are_not_told_apart(tmp_path):
     volts = written(tmp_path / "log.csv", header="t [s],motor [mm],command [V],reference [mm]")
     said = " ".join(run(volts).output.split())
@@ -56,6 +57,7 @@ def test_of_a_voltage_it_is_said_that_resistance_and_torque_constant_are_not_tol
     assert "cannot be told apart" not in run(volts, "--inertia", 20).output
 
 
+@pytest.mark.slow
 def test_units_at_the_end_of_a_name_are_those_in_brackets(log, tmp_path):
     ends = written(tmp_path / "ends.csv", header="time_s,motor_mm,force_n,reference_mm")
     one, other = (json.loads(run(each, "--json").stdout)["inverse_dynamics"] for each in (log, ends))
@@ -66,6 +68,7 @@ def test_units_at_the_end_of_a_name_are_those_in_brackets(log, tmp_path):
     assert "kg m^2" in run(torque).output
 
 
+@pytest.mark.slow
 def test_times_that_may_be_milliseconds_are_named(tmp_path):
     recording, header = simulated(), "time,motor [mm],force [N],reference [mm]"
     time = np.round(1e3 * np.arange(recording.position.size) / recording.rate)
@@ -79,6 +82,7 @@ def test_times_that_may_be_milliseconds_are_named(tmp_path):
     assert remark in " ".join(refused.output.split())
 
 
+@pytest.mark.slow
 def test_counts_are_parts_of_a_turn(log, tmp_path):
     recording = simulated()
     counts = {name: np.round(4096 * 100.0 * values) for name, values in
@@ -150,6 +154,7 @@ def test_json_and_page_say_the_same(files):
     assert "Next experiment" in page
 
 
+@pytest.mark.slow
 def test_without_a_scale_a_known_mass_gives_it(tmp_path):
     counts = written(
         tmp_path / "log.csv", header="t [s],motor [mm],current [A],reference [mm]", force=simulated().force / 40.0
@@ -194,6 +199,7 @@ def test_a_bad_log_is_refused_in_one_sentence(tmp_path, monkeypatch, change, opt
     assert not (tmp_path / "axis.toml").exists()
 
 
+@pytest.mark.slow
 def test_an_axis_file_needs_a_controller(tmp_path):
     lone = written(tmp_path / "log.csv", prescribed(), header="t [s],motor [mm],force [N],nothing")
     result = run(lone, "-o", tmp_path / "axis.toml")
@@ -244,12 +250,14 @@ def with_load(path, motor=1.0, command=1.0, unit="mm"):
     return written(path, header=header, **columns, load=1e3 * load)
 
 
+@pytest.mark.slow
 def test_a_gap_on_a_rigid_shaft_is_no_elasticity(tmp_path):
     found = st.commission(with_load(tmp_path / "log.csv", unit="rad"))
     assert found.drive.split is None
     assert found.axis.transmission == st.Transmission(found.axis.p)
 
 
+@pytest.mark.slow
 def test_the_ratio_of_two_lengths_is_no_travel_per_radian(tmp_path):
     """A torque on a linear axis has no force without a lead."""
     found = st.commission(with_load(tmp_path / "log.csv"))
@@ -257,12 +265,14 @@ def test_the_ratio_of_two_lengths_is_no_travel_per_radian(tmp_path):
     assert found.best["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_motor_that_counts_against_its_load_is_turned(tmp_path):
     found = st.commission(with_load(tmp_path / "log.csv", -1.0, -1.0, "rad"))
     assert found.axis.p == pytest.approx(0.01 / (2.0 * np.pi), rel=1e-3)
     assert found.drive.law.position_gain == pytest.approx(GAINS["position_gain"], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -291,6 +301,7 @@ def test_a_reference_of_another_kind_or_side_is_told(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_rate_that_contradicts_the_times_of_the_log_is_told(log):
     told = run(log, "--rate", 1000).output
     assert "samples timed by --rate 1000 Hz, though the log's own times say 500 Hz: 3684" in told
@@ -303,6 +314,7 @@ def rows_of(log):
     return head, rows
 
 
+@pytest.mark.slow
 def test_a_log_with_the_newest_sample_first_is_turned_round(log, tmp_path):
     head, rows = rows_of(log)
     turned = tmp_path / "turned.csv"

@@ -109,6 +109,7 @@ def test_a_store_that_was_cut_to_nothing_is_not_checked_as_a_new_one(tmp_path: P
     assert file.stat().st_size == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["twin", "check"], ["servos"], ["twin"], ["backup", "b.db"], ["restore", "b.db"]])
 def test_a_folder_in_the_place_of_the_store_is_called_one(tmp_path: Path, command: list[str]) -> None:
     config = twin_file(tmp_path)

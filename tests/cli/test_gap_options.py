@@ -53,6 +53,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(arguments: tuple[str, ...]
     assert sentence in " ".join(result.output.split())
 
 
+@pytest.mark.slow
 def test_a_limit_cycle_is_that_of_the_same_gap_at_the_motor() -> None:
     pitch = Servo.preset("paper").p
     at_load, at_motor = (

@@ -228,6 +228,7 @@ def test_a_log_of_a_motor_that_shows_nothing_is_refused(motor_logs: Path, name: 
         identify(IdentifyOptions(motor_logs / f"{name}.csv", named))
 
 
+@pytest.mark.slow
 def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) -> None:
     """The table goes straight to its place behind a worm that holds the gap: each step leaves it on one flank."""
     gap, path = math.radians(7.5), tmp_path / "log.npz"
@@ -247,6 +248,7 @@ def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) 
     assert "--window" not in both
 
 
+@pytest.mark.slow
 def test_the_estimates_of_a_log_are_reported_one_by_one(logs: Path) -> None:
     reported: list[tuple[int, int]] = []
     options = IdentifyOptions(logs / "own.npz", window=1.9, wear_deg=0.1, wear_over_s=10.0, gap_limit_deg=3.0)

@@ -117,6 +117,7 @@ def test_reasons_that_differ_by_their_numbers_only_are_one(loop: Loop) -> None:
     assert line.endswith(f"s and {len(grows) - 1} more, the first: may grow to 1.5 deg")
 
 
+@pytest.mark.slow
 def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_path: Path) -> None:
     console = Console(record=True, width=200)
     assert record(file, console=console, figure=tmp_path / "run.png", windows=True) is None

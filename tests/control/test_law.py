@@ -108,6 +108,7 @@ def test_a_ramp_of_the_reference_is_fed_forward_in_proportion_to_its_speed() -> 
     assert voltages[-1] == pytest.approx(190.0 * speed, rel=6e-3)
 
 
+@pytest.mark.slow
 def test_the_velocity_feedforward_starts_from_rest_and_ends_in_it() -> None:
     law = PAPER.replace(Ki=0.0, velocity_feedforward=190.0).law()
     assert tick(law, start(2e-3), 2e-3, 2e-3).voltage == 0.0

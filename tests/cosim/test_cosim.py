@@ -211,6 +211,7 @@ def test_quantisation_to_int16_moves_the_estimate_by_less_than_a_thousandth_of_a
     assert max(q.theta_m_step for q in found) < math.radians(0.011)
 
 
+@pytest.mark.slow
 def test_fig_15_with_the_gap_known_exactly():
     scenario = Scenario.preset("fig15")
     loop = cosimulate(scenario, estimator=known_gap(scenario.gap, scenario.duration))

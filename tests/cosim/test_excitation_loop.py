@@ -61,6 +61,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
     assert found.interval[0] < 10.0 * DEG < found.interval[1]
 
 
+@pytest.mark.slow
 def test_an_edge_that_refuses_longer_windows_gets_no_second_request() -> None:
     short = Recording(window=1.0, pre_trigger=0.0)
     loop = cosimulate(calm(ExcitationSettings(), recording=short, reference=UPWARDS, duration=50.0))

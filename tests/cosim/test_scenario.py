@@ -38,6 +38,7 @@ def test_fig16_adds_noise_and_filters_to_the_sampled_loop():
     assert noisy.twin.estimator == paper.PaperSettings(lowpass_hz=20.0)
 
 
+@pytest.mark.slow
 def test_an_unknown_preset_is_named():
     with pytest.raises(InvalidInput, match=r"'fig51'.*fig15, fig15-sampled, fig16, calm, certified"):
         Scenario.preset("fig51")

@@ -41,6 +41,7 @@ def test_every_key_of_the_papers_estimator_is_read(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_every_key_of_the_default_estimator_is_read(tmp_path):
     lines = ["passes = 3", "order = 40", "starts = 9", "kept = 2", "skew = false", "largest_skew_s = 0.001"]
     lines += ["gap_rate_deg_per_s = 1", "offset_deg = [-2, 3]", "prefilter_hz = 80", "contact_travel_deg = 1"]

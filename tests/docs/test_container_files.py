@@ -115,6 +115,7 @@ def test_the_services_run_the_images_with_little_rights_and_their_folders() -> N
     assert {each.split(":")[1] for each in twin["volumes"]} >= set(re.findall(r"_DIR=(\S+)", stage("twin")["ENV"][0]))
 
 
+@pytest.mark.slow
 def test_compose_takes_its_file(tmp_path: Path) -> None:
     compose = needed("docker-compose")
     shutil.copy(FOLDER / "compose.yaml", tmp_path)

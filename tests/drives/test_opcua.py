@@ -218,6 +218,7 @@ def test_without_asyncua_the_error_names_the_extra(monkeypatch: pytest.MonkeyPat
 URL = "opc.tcp://127.0.0.1:4840"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "message"),
     [

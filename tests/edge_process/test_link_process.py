@@ -39,6 +39,7 @@ def twin() -> Iterator[FakeTwin]:
         yield twin
 
 
+@pytest.mark.slow
 def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_process(
     tmp_path: Path, twin: FakeTwin, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,7 @@ def test_the_angle_of_a_stepper_comes_from_its_command(stage_run: st.Run) -> Non
     assert np.abs(made.theta_m - true).max() < 1e-5 * np.ptp(true)
 
 
+@pytest.mark.slow
 def test_the_gap_of_a_stepper_without_encoder_is_estimated(stage_run: st.Run) -> None:
     estimate = st.estimate_gap(st.Window.from_run(stage_run, start=0.0, duration=2.0), STAGE)
     assert estimate.ok, estimate.reasons

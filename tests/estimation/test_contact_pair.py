@@ -93,6 +93,7 @@ def test_two_windows_show_the_gap_and_a_third_confirms_it():
     assert [e.contact.side for e in (first, second, *later)] == [-1.0, 1.0, -1.0, 1.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [1e-7, 4e-7])
 def test_intervals_hold_in_noise(noise):
     """Errors of up to 2.5 standard deviations; the offset, the middle of both contacts, is told as well as the gap."""
@@ -186,6 +187,7 @@ def told(made: list[GapEstimate]) -> list[str]:
     return sentences
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wide", [5.6, 12.0])
 def test_two_machines_by_turns_show_no_gap_between_theirs(wide):
     """Each contact is followed by the other machine's on the same side, half of the difference further out."""

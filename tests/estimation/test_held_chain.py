@@ -153,6 +153,7 @@ def test_friction_that_could_be_all_of_the_gap_is_refused() -> None:
     assert "with the stated load friction the gap would be" in estimate.reasons[0]
 
 
+@pytest.mark.slow
 def test_a_twin_believes_friction_as_far_as_it_is_known() -> None:
     window, axis = measured(worn(screw_axis(3, 0.118)), noise=1e-6), screw_axis(3, 0.1)
     known = TwinSettings().uncertainty
@@ -161,6 +162,7 @@ def test_a_twin_believes_friction_as_far_as_it_is_known() -> None:
         assert estimator_of(axis, settings)(window, Expectation(None)).ok == believed
 
 
+@pytest.mark.slow
 def test_friction_that_falls_with_the_speed_widens_the_interval() -> None:
     axis = screw_axis(3, 0.02)
     falling = axis.replace(load=dataclasses.replace(axis.load, static=0.024, stribeck=1e-3))
@@ -172,6 +174,7 @@ def test_friction_that_falls_with_the_speed_widens_the_interval() -> None:
     assert stated.std_total > plain.std_total
 
 
+@pytest.mark.slow
 def test_a_loop_that_touches_one_side_gets_a_lower_bound() -> None:
     run = worn(screw_axis(3, 0.1), CALM)
     estimate = estimate_gap(measured(run, 3.8, 2.0, noise=1e-6), screw_axis(3, 0.1))
@@ -179,6 +182,7 @@ def test_a_loop_that_touches_one_side_gets_a_lower_bound() -> None:
     assert not estimate.gap > GAP
 
 
+@pytest.mark.slow
 def test_an_interval_with_gaps_that_the_motor_does_not_cross_has_no_upper_end() -> None:
     """The motor's way is 15 % wider than the gap; a load that swings on its own hides how little it is pushed."""
     axis, time = screw_axis(2, 0.01), np.arange(1000) / 200.0
@@ -193,6 +197,7 @@ def test_an_interval_with_gaps_that_the_motor_does_not_cross_has_no_upper_end() 
     assert 0.5 * GAP < unsure.gap < GAP
 
 
+@pytest.mark.slow
 def test_the_estimate_does_not_depend_on_units() -> None:
     """A thousandth of all lengths, with forces as they are."""
     axis, size = screw_axis(2, 0.1), 1e-3

@@ -116,6 +116,7 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(name: str) -> Non
     assert left(0.0) > 30.0 * left(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AXES)
 def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
     """Of a machine whose screw is softer, whose motor is stronger and whose load is less damped than in the model."""
@@ -180,6 +181,7 @@ def test_the_motion_has_no_side_and_no_unit() -> None:
         np.testing.assert_allclose(other.simulate(changed, rate)[0], factor * plain, rtol=0.0, atol=1e-9 * abs(factor))
 
 
+@pytest.mark.slow
 def test_a_motor_that_stays_on_its_flank_shows_no_gap() -> None:
     """A load on a spring that is pushed forwards only."""
     axis = held_axis(ground=0.3)
@@ -191,6 +193,7 @@ def test_a_motor_that_stays_on_its_flank_shows_no_gap() -> None:
     assert math.isnan(estimate.gap)
 
 
+@pytest.mark.slow
 def test_a_fit_that_leaves_more_than_noise_is_not_believed() -> None:
     """A wrong minimum was 40 % off and left 2 % of the gap, where the true one leaves a count."""
     window = at_motor(swung(AXES["one mass"]))
@@ -201,6 +204,7 @@ def test_a_fit_that_leaves_more_than_noise_is_not_believed() -> None:
     assert any("more than noise" in reason for reason in estimate.reasons)
 
 
+@pytest.mark.slow
 def test_the_twin_estimates_the_gap_and_verifies_no_setting() -> None:
     """The edge records the motor's angle as the position; what such a loop leaves of the load was never measured."""
     axis = AXES["one mass"]
@@ -214,6 +218,7 @@ def test_the_twin_estimates_the_gap_and_verifies_no_setting() -> None:
         check_gap_in_loop(axis)
 
 
+@pytest.mark.slow
 def test_a_quick_fit_tells_whether_the_gap_moved() -> None:
     axis = AXES["one mass"]
     fits, window = quick_fits_of(axis), at_motor(swung(axis))

@@ -31,6 +31,7 @@ def voltage_window() -> Window:
     return Window(1e-3 * np.sin(9.0 * t), voltage=voltage, sample_rate=5000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("names", "make_window"), [(ANGLE, angle_window), (VOLTAGE, voltage_window)])
 def test_derivatives_are_those_of_the_projected_residual(names, make_window):
     """The cost's gradient, which the projection's own derivatives do not enter, to the rounding of differences."""

@@ -40,6 +40,7 @@ def test_prompt_windows_hold_what_was_true_at_each_sample(window: st.Window) -> 
     assert prompt_plant(AXIS) is AXIS
 
 
+@pytest.mark.slow
 def test_a_stated_delay_costs_no_window(window: st.Window) -> None:
     """Where it is not stated, the model leaves motion that friction might explain."""
     told, untold = st.estimate_gap(window, LATE), st.estimate_gap(window, AXIS)
@@ -49,6 +50,7 @@ def test_a_stated_delay_costs_no_window(window: st.Window) -> None:
     assert not untold.ok
 
 
+@pytest.mark.slow
 def test_the_twin_takes_off_the_same_delay_once(window: st.Window) -> None:
     settings = TwinSettings().on(LATE)
     expected = Wear(settings.initial_gap).expect(settings.trend, "boot", 0.4, 0.4, settings.learning)
@@ -58,6 +60,7 @@ def test_the_twin_takes_off_the_same_delay_once(window: st.Window) -> None:
     assert found.model_version == LATE.version
 
 
+@pytest.mark.slow
 def test_the_joint_estimate_knows_the_delay(window: st.Window) -> None:
     (gap,) = st.estimate_jointly(window, LATE).gaps
     assert gap.ok

@@ -111,6 +111,7 @@ def test_a_shaft_is_adapted_by_its_own_numbers_alone() -> None:
     assert (made.load.k, made.load.c) == (TWO_LOADS.load.k, TWO_LOADS.load.c)
 
 
+@pytest.mark.slow
 def test_another_machine_than_the_learnt_one_is_refused_where_a_wrong_gap_hides_its_shaft() -> None:
     """Within what was learnt a gap that is 18 % too wide fits best, with an interval of 47 % of it to either side."""
     joint, gap = Axis.preset("robot-joint"), 0.5
@@ -128,6 +129,7 @@ def test_another_machine_than_the_learnt_one_is_refused_where_a_wrong_gap_hides_
             assert "another shaft than the one that was learnt" in made.reasons[0]
 
 
+@pytest.mark.slow
 def test_one_more_start_finds_what_a_search_has_missed_and_spoils_nothing() -> None:
     found = fit(recorded(TWO_MASS, 0.01), TWO_MASS, None, OutputErrorSettings())
     values = found.best.values.copy()

@@ -222,6 +222,7 @@ def test_an_angle_without_its_counts_stays_within_them() -> None:
     assert np.array_equal(without_counts(truth, 0.0), truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 8])
 def test_a_lag_that_averages_the_motor_s_rounding_is_not_taken_for_one(seed: int) -> None:
     """Noise of one count at the load, and steps of a loop in it: 1.8 +- 0.5 and 2.6 +- 1.0 deg were said of 1.04 and

@@ -63,6 +63,7 @@ def test_finds_the_gap_of_other_servos(servo):
     assert math.degrees(estimate.gap) == pytest.approx(10.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_an_estimate_names_its_model_and_method():
     window = measured(math.radians(10.0))
     estimate = estimate_gap(window, SERVO, prior=math.radians(9.0))

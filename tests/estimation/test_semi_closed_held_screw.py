@@ -56,6 +56,7 @@ def test_small_steps_and_located_events_move_alike() -> None:
     assert apart[1][1] < 0.5 * apart[0][1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("encoders", [1, 2])
 @pytest.mark.parametrize("damped", [0.0, 0.1])

@@ -39,6 +39,7 @@ def test_jitter_of_the_times_is_measured_and_widens_the_interval_or_is_refused()
         assert not estimate.ok or high - low >= 4.0 * (2.0 / SCREW.p) * jitter.half
 
 
+@pytest.mark.slow
 def test_a_window_without_jitter_shows_none() -> None:
     gap, window = screw()
     jitter = time_jitter(fit(window, SCREW, None, OutputErrorSettings()))

@@ -93,6 +93,7 @@ def test_a_gap_behind_a_soft_shaft_lies_inside_or_is_refused():
     assert estimate.status in (GapStatus.OK, GapStatus.UNIDENTIFIABLE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "said"), [(1.0, True), (0.01, False)])
 def test_a_soft_touch_that_leaves_more_than_noise_is_refused_in_words(factor, said):
     """Beside the minimum; of a shaft with a hundredth of the stiffness the crossing is not slow."""

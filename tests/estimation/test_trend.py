@@ -197,6 +197,7 @@ def test_a_lower_bound_moves_only_what_lies_below_it():
     assert "lower bound" in pushed.reasons[0]
 
 
+@pytest.mark.slow
 @given(st.floats(-30.0, 30.0))
 def test_truncated_moments_are_those_of_a_cut_normal(margin):
     pull, cut = truncation(margin)

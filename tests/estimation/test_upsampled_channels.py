@@ -60,6 +60,7 @@ def test_a_slow_angle_of_a_servo_is_named_and_bounds_no_gap(slow, how):
     assert "give the window at 625 Hz" in sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("every", [2, 5, 20])
 def test_slow_channels_of_presets_are_named_and_those_as_they_should_be_are_not(name, every):
@@ -130,6 +131,7 @@ def test_a_position_that_a_slower_law_read_is_late_as_others_are():
     assert not any("slower" in reason for reason in made.reasons)
 
 
+@pytest.mark.slow
 def test_a_stepper_counts_as_it_may():
     """Its counter changes with its command."""
     axis, gap, window = preset_window("stepper-stage")

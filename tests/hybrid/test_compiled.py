@@ -137,6 +137,7 @@ def with_subroutine(a: float, b: float, c: float) -> float:
     return fma_by_hand(a, b, c)
 
 
+@pytest.mark.slow
 def test_a_subroutine_is_a_part_of_its_callers_and_python_can_call_it() -> None:
     """Its library holds no function that is executable; what Python calls is compiled for that, and gives the same."""
     values = 0.1, 0.2, 0.3

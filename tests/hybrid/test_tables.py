@@ -95,6 +95,7 @@ def test_powers_of_a_part() -> None:
             assert np.all(np.abs(powers[which, :, k].T - expected) <= 1e-14 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_part_of_a_step_is_an_exponential(shape: Shape) -> None:
     """To the rounding of what enters it, however much cancels."""

@@ -47,6 +47,7 @@ def test_a_broker_that_ends_the_connection_unanswered_is_said_with_the_likely_re
     )
 
 
+@pytest.mark.slow
 def test_a_broker_that_accepts_the_connection_and_never_answers_is_said_to_hang(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -64,6 +65,7 @@ def test_a_broker_that_accepts_the_connection_and_never_answers_is_said_to_hang(
             connection.close()
 
 
+@pytest.mark.slow
 def test_a_broker_that_misses_the_pings_itself_is_not_said_to_hang() -> None:
     said: queue.Queue[str] = queue.Queue()
     with socket.create_server(("127.0.0.1", 0)) as port:
@@ -82,6 +84,7 @@ def test_a_broker_that_misses_the_pings_itself_is_not_said_to_hang() -> None:
             connection.close()
 
 
+@pytest.mark.slow
 def test_a_connection_that_is_being_made_does_not_hold_up_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """As to an address that swallows packets: a stop waited for the client's own time limit, 5 s."""
     began, gone = threading.Event(), threading.Event()

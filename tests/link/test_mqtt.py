@@ -55,6 +55,7 @@ def test_small_packets_leave_at_once(server: Mosquitto, store: Store) -> None:
         assert here._connection._client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
 
 
+@pytest.mark.slow
 def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store) as one, twin(at, store) as other, edge(at) as first, edge(at, "axis-2") as second:
@@ -159,6 +160,7 @@ def test_a_window_of_another_servo_is_refused(server: Mosquitto, store: Store) -
     assert kept(store) == kept(store, "axis-2") == []
 
 
+@pytest.mark.slow
 def test_too_large_a_message_is_refused_before_it_is_sent_or_parsed(server: Mosquitto, store: Store) -> None:
     big = bytes(MAX_BYTES + 1)
     with twin(Broker(server.url), store) as there, edge(Broker(server.url), timeout_s=2.0) as here:

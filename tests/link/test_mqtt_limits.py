@@ -38,6 +38,7 @@ def test_a_message_larger_than_what_the_broker_takes_is_not_sent_and_said(tmp_pa
         assert kept(store) == [0]
 
 
+@pytest.mark.slow
 def test_a_broker_that_ends_the_connection_at_a_message_is_said_to_do_so(tmp_path: Path, store: Store) -> None:
     """As one with a limit that it does not tell."""
     with (
@@ -56,6 +57,7 @@ def test_a_silent_twin_is_not_said_to_be_a_lost_connection(server: Mosquitto) ->
         assert "connection" not in delivered_or_why(here, parcel(0))
 
 
+@pytest.mark.slow
 def test_a_message_that_is_too_large_for_the_limit_of_a_broker_that_came_back_holds_up_no_other(
     tmp_path: Path, store: Store
 ) -> None:

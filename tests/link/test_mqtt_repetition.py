@@ -20,6 +20,7 @@ from servotwin.link.seal import key_of, verifier_of
 from servotwin.store.store import Store
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["up", "down"])
 def test_a_request_or_an_answer_that_is_lost_on_the_way_is_repeated_before_its_time_is_over(
     server: Mosquitto, store: Store, way: str
@@ -36,6 +37,7 @@ def test_a_request_or_an_answer_that_is_lost_on_the_way_is_repeated_before_its_t
     assert there.metrics.stored.values[("window", "new")] == 2
 
 
+@pytest.mark.slow
 def test_answers_that_are_lost_for_ever_do_not_use_up_what_the_broker_allows(
     server: Mosquitto, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

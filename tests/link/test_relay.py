@@ -82,6 +82,7 @@ def test_a_cut_ends_connections_and_new_ones_work(echo: int) -> None:
         assert relay.counts["connection"] == 2
 
 
+@pytest.mark.slow
 def test_stalled_data_comes_later_and_half_open_never(echo: int) -> None:
     with Relay(echo) as relay, connect(relay.port) as connection:
         relay.become(State.STALLED)

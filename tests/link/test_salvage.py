@@ -264,6 +264,7 @@ def test_a_damaged_first_page_loses_no_window(tmp_path: Path) -> None:
     box.close()
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_read_the_last_status_tells_how_many_windows_are_lost(tmp_path: Path) -> None:
     path = filled(tmp_path, WINDOWS)
     path.write_bytes(os.urandom(path.stat().st_size))

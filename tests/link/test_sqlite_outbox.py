@@ -242,6 +242,7 @@ def test_a_corrupt_file_is_put_aside(outbox: SqliteOutbox, path: Path, wal: bool
     fresh.close()
 
 
+@pytest.mark.slow
 def test_a_file_corrupted_while_open_is_put_aside_and_its_windows_are_counted(outbox: SqliteOutbox, path: Path) -> None:
     for k in range(30):
         outbox.put(window(k, samples=3000))
@@ -264,6 +265,7 @@ def test_a_file_corrupted_while_open_is_put_aside_and_its_windows_are_counted(ou
 STEPS = st.lists(st.tuples(st.sampled_from("prdlt"), st.integers(0, 9), st.booleans()), max_size=30)
 
 
+@pytest.mark.slow
 @examples(40, deadline=None)
 @given(steps=STEPS)
 def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPathFactory, steps: list) -> None:

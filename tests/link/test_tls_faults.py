@@ -132,6 +132,7 @@ ASKED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*ssl.SSLSocket:pytest.PytestUnraisableExceptionWarning")  # paho closes it so
 @pytest.mark.parametrize(
     ("ask", "fault", "words"), ASKED, ids=[f"{ask.__name__}-{fault.__name__}" for ask, fault, _ in ASKED]

@@ -137,6 +137,7 @@ def test_a_small_step_back_of_the_clock_is_no_second_log(tmp_path, made):
     assert read_recording(table(tmp_path / "back.csv", made, rows), RecordingColumns()).found
 
 
+@pytest.mark.slow
 def test_exchanged_columns_are_said_to_be(tmp_path, made):
     path = table(tmp_path / "log.csv", made)
     ran = CliRunner().invoke(app, ["identify", str(path), "--motor", "load", "--load", "motor", "--json"])

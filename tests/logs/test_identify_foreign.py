@@ -202,6 +202,7 @@ def test_a_foreign_log_is_converted_without_its_defects(tmp_path, made):
     assert np.allclose(log.recording.motor, np.delete(made.motor, 100), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_wear_over_three_logs_in_calendar_time(tmp_path):
     logs = []
     for month, gap in (("01", 0.05), ("04", 0.055), ("07", 0.06)):

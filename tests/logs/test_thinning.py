@@ -73,6 +73,7 @@ def test_a_lag_far_below_the_steps_of_a_thinned_log_is_found(lag, speed):
     assert found.lag == pytest.approx(lag, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_log_of_an_hour_shows_the_swinging_load_that_five_minutes_show():
     # Stretches of a second held no stroke of this motion: an hour was refused, where 60 s of it told the gap.
     run = simulate(Axis.preset("two-mass-drive"), 300.0, reference=SquareWave(0.2, 4.0), gap=0.02, sample_rate=1000.0)

@@ -57,6 +57,7 @@ def test_a_stack_is_its_automata(k_d, friction, dead_zone, limit, filtered) -> N
         assert_equal(plants, place, sampled_plant(servo, 1, True, friction))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "friction"), [("two-mass-drive", False), ("robot-joint", True), ("ball-screw", True)])
 def test_a_stack_of_axes_is_their_automata(name: str, friction: bool) -> None:
     """Shafts that are free in the gap, with friction of motor and load; to rounding, as sums are taken otherwise."""

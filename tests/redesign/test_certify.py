@@ -165,6 +165,7 @@ def test_a_decision_is_the_same_whenever_it_is_made() -> None:
     assert first.seconds == 1.0
 
 
+@pytest.mark.slow
 def test_of_laws_that_cost_alike_the_one_without_velocity_feedforward_is_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -200,6 +201,7 @@ def test_a_law_whose_plainer_one_is_verified_is_not_verified_to_its_end(monkeypa
     assert finished == [found.setting]
 
 
+@pytest.mark.slow
 def test_a_motor_at_its_limit_takes_a_setting_that_saves_much_of_the_little_that_a_law_can_change() -> None:
     """Two percent of the whole cost are more than a tenth of what the motor does not need at full speed."""
     servo, known = SERVO.replace(voltage_limit=1.0), Uncertainty(gap=gaps(24, 27), usual_step=(1.8e-3, 1.8e-3))

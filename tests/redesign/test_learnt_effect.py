@@ -132,6 +132,7 @@ def table() -> TablePolicy:
     )
 
 
+@pytest.mark.slow
 def test_a_machine_outside_of_the_stated_half_widths_is_verified_before_anything_is_sent() -> None:
     inside, outside = (table().redesign(evidence(learnt(each))) for each in (OFF_BY[0], (1.5, 1.3, 1.0, 1.0)))
     assert inside.to_verify is not None

@@ -161,6 +161,7 @@ def test_a_looked_up_setting_is_verified_for_the_region(one, other, fed, left, n
     assert exact.gap == requested.gap
 
 
+@pytest.mark.slow
 def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
     """A cell that is verified without a feedforward holds for all."""
     setting = table().fallback.setting

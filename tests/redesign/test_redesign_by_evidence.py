@@ -40,6 +40,7 @@ def known_gap(gap: float) -> GapEstimate:
     return GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
 
 
+@pytest.mark.slow
 def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     # A velocity feedforward makes calm gains as quick, so that livelier ones are not chosen.
     demands = replace(SMALL, scales=(0.5, 0.7, 1.0), velocity_feedforward=False)
@@ -115,6 +116,7 @@ def test_a_first_voltage_at_rest_may_be_frictions_and_is_not_fed_forward() -> No
     assert smooth.setting.gains.feedforward == -0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "stays"), [(0.98, True), (0.5, False)])
 def test_a_running_setting_that_is_hardly_dearer_stays(share: float, stays: bool) -> None:
     policy = CertifiedPolicy(SERVO, Uncertainty(), replace(SMALL, scales=(0.5, 0.7)))

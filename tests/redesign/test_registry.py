@@ -187,6 +187,7 @@ def test_a_sample_rate_says_nothing_of_gains(tmp_path):
     assert scenario.start_law.sample_rate == 5000.0
 
 
+@pytest.mark.slow
 def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)

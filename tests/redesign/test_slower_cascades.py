@@ -42,6 +42,7 @@ def test_a_slower_cascade_keeps_the_phases_of_a_rigid_axis_at_its_crossovers() -
     assert loop(slowed(own, 0.3), 0.3 * omega) == pytest.approx(loop(own, omega))
 
 
+@pytest.mark.slow
 def test_slower_cascades_are_tried_with_their_integral_where_the_own_gains_are_out_of_bounds() -> None:
     laws = [each.controller for each in candidates_of(WORM_TABLE, KNOWN, FEW, disturbed=True, noisy=False)]
     assert any(integrates(law) for law in laws)

@@ -91,6 +91,7 @@ def test_a_law_without_integral_action_lets_the_load_sink_to_where_it_holds_it()
 AXES = {"friction that falls, limit": STICKY, "hanging": FREE}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AXES)
 def test_members_of_an_ensemble_are_runs(name: str) -> None:
     axes = [AXES[name], AXES[name].scaled({"k": 1.2, "m": 0.9})]
@@ -103,6 +104,7 @@ def test_members_of_an_ensemble_are_runs(name: str) -> None:
             assert np.abs(found[i] - alone).max() < 1e-9 * 0.2, (i, law)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AXES)
 def test_blocks_of_ticks_are_the_ticks(name: str) -> None:
     law = LAW.replace(sample_rate=10_000.0)

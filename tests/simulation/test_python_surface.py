@@ -104,6 +104,7 @@ def test_both_edges_of_the_dead_zone_are_one_curve_of_the_legend(servo):
     pyplot.close("all")
 
 
+@pytest.mark.slow
 def test_a_run_becomes_an_arrow_table(run):
     table = run.to_arrow()
     assert table.column_names[:3] == ["time_s", "position_m", "measured_position_m"]

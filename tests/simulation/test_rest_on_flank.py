@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from servotwin.hybrid.crossing import rounding, series
 from servotwin.hybrid.kernel import follow_schedule
@@ -42,6 +43,7 @@ def _after_a_step(engine: SampledEngine, x: np.ndarray, mode: int) -> int:
     return int(at[1])
 
 
+@pytest.mark.slow
 def test_a_rest_at_the_limit_of_rounding_ends_in_one_mode() -> None:
     """Where the first derivative that is not zero is as large as its rounding and the next one has the other sign,
     modes that read different ones would take turns without end."""

@@ -1,5 +1,6 @@
 """Whose messages a lease takes, and which, on SQLite and on PostgreSQL."""
 
+import pytest
 from store_cases import bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.store.leases import MAX_LEASE_BYTES
@@ -132,6 +133,7 @@ def test_a_verification_leaves_the_place_among_the_estimates(store: Store) -> No
     assert [[(lease.servo, lease.estimate) for lease in turn] for turn in turns] == [[("new", False)], [("a", True)]]
 
 
+@pytest.mark.slow
 def test_large_messages_are_leased_a_few_at_a_time(store: Store) -> None:
     large, small = b"x" * (MAX_LEASE_BYTES // 2), b"y"
     store.put([window("a", sequence, large) for sequence in range(3)])

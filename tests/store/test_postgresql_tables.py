@@ -50,6 +50,7 @@ def run(store: Store, *statements: str) -> None:
             connection.execute(sa.text(statement))
 
 
+@pytest.mark.slow
 def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
     postgres_server: postgres.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,6 +144,7 @@ def is_cut(connection: psycopg.Connection[Any]) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_every_page_of_zeros_in_an_index_is_found_above_its_leaves_too() -> None:
     with postgres.running() as server:
         address = server.database("wide")
@@ -174,6 +176,7 @@ def test_every_page_of_zeros_in_an_index_is_found_above_its_leaves_too() -> None
                 index.write(whole)
 
 
+@pytest.mark.slow
 def test_a_check_of_tables_ends_in_time_and_says_so(filled: Store) -> None:
     run(filled, "INSERT INTO evidence (servo, kind, status, created, body) "
         "SELECT 'a', 'trend', '', 0, '' FROM generate_series(1, 300000)")  # fmt: skip

@@ -181,6 +181,7 @@ def test_a_message_that_arrives_while_its_servo_is_leased_is_not_lost(store: Sto
     assert (again.serial, len(again.messages)) == (1, 1)
 
 
+@pytest.mark.slow
 def test_no_message_is_lost_when_results_and_messages_are_committed_at_once(store: Store) -> None:
     total, done = 150, threading.Event()
 

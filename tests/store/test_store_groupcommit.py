@@ -67,6 +67,7 @@ def results(futures: Sequence[Future[PutResult]]) -> list[PutResult]:
     return [future.result(PATIENCE_S) for future in futures]
 
 
+@pytest.mark.slow
 def test_messages_and_results_of_many_threads(store: Store, group: GroupCommit) -> None:
     store.put([window("worked")])
     (claim,) = store.lease("me", 1, 30.0, 200.0)

@@ -5,6 +5,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import sqlalchemy as sa
 from servers import find
 from store_cases import NewAddress, claim, outcome, window
@@ -93,6 +94,7 @@ def dumped(url: str, to: Path) -> Callable[[str], None]:
     return lambda other: run("pg_restore", sa.make_url(other).database, "--no-owner", str(to))
 
 
+@pytest.mark.slow
 def test_a_store_of_the_revision_before_goes_forth_and_back_from_its_backup(
     new_address: NewAddress, tmp_path: Path
 ) -> None:

@@ -62,6 +62,7 @@ def settled(count: int) -> Twin:
     return fed(new(), windows(GAP)[:count])
 
 
+@pytest.mark.slow
 def test_windows_that_say_nothing_new_get_a_glance() -> None:
     log = settled(6).log
     assert len(log.estimates) == 1

@@ -105,6 +105,7 @@ def test_two_machines_under_one_name_get_no_setting_until_three_windows_in_a_row
     assert "two machines" in seen.redesigns[4].reason
 
 
+@pytest.mark.slow
 def test_a_machine_that_was_exchanged_for_good_is_learnt_and_gets_its_settings():
     """Once it is learnt, windows of the old one are those of a second machine."""
     seen = by_turns([0.01, 0.01, 0.2, 0.2, 0.2])

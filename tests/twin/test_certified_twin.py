@@ -76,6 +76,7 @@ def test_what_is_verified_is_sent_with_its_certificate_and_band():
     assert redesign.reason == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", [(55.0, 61.0), (70.0, 80.0), (10.0, math.inf)])
 def test_an_interval_wider_than_what_is_certified_sends_nothing(gap_deg):
     sent, redesign = answer(gap_deg)

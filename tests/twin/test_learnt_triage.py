@@ -119,6 +119,7 @@ def test_the_machines_spread_is_that_of_fits_to_other_machines() -> None:
     assert here.machine_spread().gap == pytest.approx(float(np.linalg.norm(moved)), rel=0.05)
 
 
+@pytest.mark.slow
 def test_glances_keep_little_of_the_machines_that_they_have_seen() -> None:
     """A worker of a fleet meets thousands of machines, each of which comes back after all the others."""
     window = decode_window(off_windows(OFF_BY[0], 10.0, False, 0.0)[0])

@@ -56,6 +56,7 @@ def edge(window: float | None = None) -> Commissioning:
     return Commissioning(OWN, RACK.controller, TwinSettings(policy="paper", k_dz=0.0), Recording(4000.0, window))
 
 
+@pytest.mark.slow
 def test_windows_of_a_slow_loop_contain_where_the_load_is_slowed_down() -> None:
     """With the machine's own time they would end before the motor touches the other flank."""
     run = st.simulate(RACK, 4.0, reference=st.SquareWave(5e-3, 4.0), gap=math.radians(0.5), sample_rate=4000.0)

@@ -338,6 +338,7 @@ def test_estimates_in_vain_become_rare_until_something_changes() -> None:
     assert ("servo", "boot-1", 200) in store.estimates
 
 
+@pytest.mark.slow
 def test_contacts_on_both_sides_by_turns_show_the_gap_and_later_windows_need_a_glance_only() -> None:
     blind = [one for one in calm_windows() if one.sequence >= 3]
     many = [

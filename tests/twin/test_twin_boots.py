@@ -88,6 +88,7 @@ def test_a_hello_of_an_earlier_boot_tells_nothing():
     assert twin.state() == before
 
 
+@pytest.mark.slow
 def test_an_edge_says_which_gains_are_in_force():
     scenario = Scenario.preset("certified")
     hello = Agent(scenario.agent_settings()).hello()

@@ -253,6 +253,7 @@ def test_an_alarm_says_when_it_was_raised_and_when_the_message_came_that_led_to_
     assert [post.received for post in posted] == ["1970-01-02T00:00:00Z", None, None]
 
 
+@pytest.mark.slow
 def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch, caplog):
     caplog.set_level("INFO")
     posted = []

@@ -40,6 +40,7 @@ def started(
     return *asyncio.run(body()), told
 
 
+@pytest.mark.slow
 def test_a_twin_whose_clock_is_behind_its_store_says_so_with_both_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -59,6 +60,7 @@ def test_a_twin_whose_clock_is_behind_its_store_says_so_with_both_times(
     assert started(tmp_path, monkeypatch, 0.0, 3) == (200, [], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("days", [0.0, 0.5 / DAY, 4.0 / DAY, -4.0 / DAY, 1 / 24, -1 / 24, 60.0])
 def test_a_twin_whose_clock_differs_from_postgresqls_says_so_whichever_is_ahead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, postgres_server: Server, days: float

@@ -35,6 +35,7 @@ async def first_events(feed, count, after=None, allowed=lambda: None):
     return found, stream
 
 
+@pytest.mark.slow
 def test_events_tell_what_changed_and_resume_where_a_stream_broke(tmp_path):
     async def body(system, client):
         begun = position(system)

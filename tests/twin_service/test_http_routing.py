@@ -92,6 +92,7 @@ def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory
     asyncio.run(body())
 
 
+@pytest.mark.slow
 def test_every_route_is_described_and_every_described_route_exists(tmp_path):
     async def body() -> None:
         async with served(twin_file(tmp_path, "lockstep = true")) as (_, client):

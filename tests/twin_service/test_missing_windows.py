@@ -33,6 +33,7 @@ def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatc
     assert caplog.messages.count("windows missing") == 2
 
 
+@pytest.mark.slow
 def test_a_hole_is_asked_for_by_itself_and_not_with_all_that_is_between(tmp_path, monkeypatch):
     monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
     monkeypatch.setattr(missing_windows, "_LOOK_S", 1e9)

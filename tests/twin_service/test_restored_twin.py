@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import deepcopy
 from pathlib import Path
 
+import pytest
 from twin_messages import known_gap, twin_of
 
 from servotwin.edge.agent import Agent
@@ -115,6 +116,7 @@ class Edge:
             self.exchange(service)  # receipts
 
 
+@pytest.mark.slow
 def test_after_a_restore_updates_of_the_live_boot_still_arrive(tmp_path):
     clock = Clock()
     edge = Edge(tmp_path / "outbox.sqlite", clock)

@@ -84,6 +84,7 @@ def test_an_edge_with_a_backlog_is_told_the_pause_before_older_windows(serving):
     serving(body)
 
 
+@pytest.mark.slow
 def test_tokens_decide_who_may_read_and_write(serving):
     async def body(_system, client):
         path = place(window())
@@ -254,6 +255,7 @@ def test_health_names_the_unhealthy_part(serving):
     serving(body)
 
 
+@pytest.mark.slow
 def test_health_names_the_lag(serving):
     async def body(system, client):
         assert (await client.get("/healthz")).json()["degraded"] == []

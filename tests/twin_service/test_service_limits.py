@@ -149,6 +149,7 @@ def test_a_full_queue_and_a_store_that_cannot_write_are_temporary_refusals(servi
     serving(body, "queue = 2")
 
 
+@pytest.mark.slow
 def test_whoever_polls_in_a_loop_is_refused_slowly_and_others_are_not(serving, monkeypatch):
     monkeypatch.setattr(http_edge, "REFUSED_POLL_S", 0.5)
 

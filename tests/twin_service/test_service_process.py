@@ -327,6 +327,7 @@ def test_a_model_that_is_not_allowed_is_refused_by_a_worker_before_a_store_is_ma
     assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
+@pytest.mark.slow
 def test_the_service_leaves_numerics_to_its_workers():
     """Half of its start, and most of its memory."""
     code = "import sys, servotwin.twin_service.command; print(*{'numba', 'numpy', 'scipy'} & set(sys.modules))"

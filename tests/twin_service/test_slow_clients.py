@@ -62,6 +62,7 @@ async def dripped(address: tuple[str, int], begin: bytes, drop: bytes) -> bytes:
     return answer.result()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("begin", "drop"),
     [
@@ -85,6 +86,7 @@ def test_a_head_that_comes_byte_by_byte_is_cut(
     serving(tmp_path, "", body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [b"Content-Length: 100000", b"Transfer-Encoding: chunked"])
 def test_a_body_that_comes_byte_by_byte_is_refused_for_now_and_its_connection_closed(
     tmp_path: Path, length: bytes
@@ -117,6 +119,7 @@ async def health(address: tuple[str, int], trusted: ssl.SSLContext, source: str 
     return line
 
 
+@pytest.mark.slow
 def test_a_handshake_that_never_finishes_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tls_handshakes, "_HANDSHAKE_S", 0.3)
     service, trusted = tls(tmp_path)
@@ -144,6 +147,7 @@ def window_at_once(address: tuple[str, int], trusted: ssl.SSLContext, size: int)
         return line.recv(4096).partition(b"\r\n")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1000, 300_000, 2_000_000])
 def test_a_window_right_after_the_handshake_arrives_whatever_its_size(tmp_path: Path, size: int) -> None:
     service, trusted = tls(tmp_path)

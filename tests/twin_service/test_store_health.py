@@ -124,6 +124,7 @@ def test_a_store_that_hangs_is_told_although_it_gives_no_error(caplog: pytest.Lo
     assert lines(caplog)[1:] == [("store available again", "")]
 
 
+@pytest.mark.slow
 def test_health_and_metrics_answer_while_the_store_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http_operator, "_PATIENCE_S", 0.05)
     monkeypatch.setattr(store_health, "_STALLED_S", 0.1)

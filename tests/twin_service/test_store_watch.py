@@ -24,6 +24,7 @@ PAGE = 8192
 _LOST = "the twin's store has lost messages"
 
 
+@pytest.mark.slow
 def test_a_damaged_store_is_noticed_at_the_start_and_not_written(tmp_path, caplog):
     path = twin_file(tmp_path)
 
@@ -74,6 +75,7 @@ def test_a_store_that_a_newer_servotwin_migrates_while_the_twin_runs_is_said_onc
     assert caplog.messages.count("store of a newer servotwin") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passes", [True, False])
 def test_a_store_is_written_again_once_all_of_it_can_be_read(tmp_path, caplog, monkeypatch, passes):
     """As where a disk does not give pages for a while: SQLite calls that damage."""
@@ -144,6 +146,7 @@ def test_damage_that_comes_later_is_noticed_by_the_digest_of_a_body(tmp_path):
     serve(twin_file(tmp_path), body)
 
 
+@pytest.mark.slow
 def test_a_value_of_another_type_that_is_read_is_damage_until_it_is_gone(tmp_path, monkeypatch):
     """Nothing noticed it but those who read: it ended workers and tasks of the service."""
     monkeypatch.setattr(store_watch, "_TELL_S", 0.01)

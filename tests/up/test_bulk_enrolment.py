@@ -159,6 +159,7 @@ def test_a_name_and_a_file_exclude_each_other(folder: Path) -> None:
         assert (done.exit_code, done.stderr.count("give a name, or --csv")) == (2, 1)
 
 
+@pytest.mark.slow
 def test_a_store_of_another_fleet_is_refused_in_one_sentence(folder: Path) -> None:
     """Its servos may have the same names: updates of these machines would follow from the past of those."""
     for name in ("a", "b"):
@@ -230,6 +231,7 @@ def test_a_name_that_was_enrolled_meanwhile_is_refused(folder: Path, monkeypatch
     assert not (folder / "ax-1").exists()
 
 
+@pytest.mark.slow
 def test_whoever_waits_for_the_file_of_tokens_says_so(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with ThreadPoolExecutor(1) as other:
         with tokens_locked(folder / "tokens.toml"):

@@ -95,6 +95,7 @@ def test_too_few_strokes_are_said_to_be_too_few(made):
     assert "too few" in answer.reason
 
 
+@pytest.mark.slow
 def test_the_longest_part_without_a_pause_counts(made, found):
     later = replace(made, time=made.time + 60.0)
     parts = [(made, slice(0, 200)), (later, slice(None))]
@@ -157,6 +158,7 @@ def test_a_chain_of_masses_is_tried_where_the_axis_has_one_and_one_mass_does_not
     assert known.lost.at_motor == pytest.approx(GAP + 0.4 * FRICTION * (1.0 + 1.0 / 0.7), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_machine_without_friction_and_damping_may_be_given(made):
     known = with_dynamics(made, gap_within(UNKNOWN, None), drive_axis(friction=0.0, n=1))
     assert known.dynamics is not None

@@ -17,6 +17,7 @@ from servotwin.estimation.inverse_dynamics.identify import identify_drive
 P = 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integral_time", [None, 0.08])
 def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
     drive = identify_drive([simulated(integral_time)], p=P)
@@ -33,6 +34,7 @@ def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
         assert getattr(drive.law, name) == pytest.approx(true, rel=1e-3), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "every"), [(2000.0, 2), (2000.0, 8), (5000.0, 10)])
 def test_intervals_hold_in_a_log_that_is_slower_than_its_controller(rate, every):
     """No law at the log's rate is the one that ran."""
@@ -95,6 +97,7 @@ def test_intervals_hold_under_friction_that_no_model_has():
     assert fit.half_width("viscous") < 0.2 * PARAMETERS["viscous"]
 
 
+@pytest.mark.slow
 def test_two_logs_are_one_fit():
     one, two = prescribed(3), prescribed(4)
     both = identify_drive([one, two]).symmetric
@@ -173,6 +176,7 @@ def test_reference_and_position_that_are_swapped_are_told():
         identify_drive([replace(log, position=log.reference, reference=log.position)], p=P)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [20, -20])
 def test_a_command_that_is_not_of_the_positions_time_is_told(shift):
     log = prescribed()
@@ -183,6 +187,7 @@ def test_a_command_that_is_not_of_the_positions_time_is_told(shift):
     assert identify_drive([log]).late == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "lag"), [(1, 0.0), (3, 0.0), (0, 0.0005), (0, 0.0015)])
 def test_intervals_hold_where_the_drive_is_late(delay, lag):
     """By whole samples of half a millisecond, or by a current loop: inertias were 1.3 to 2.2 half-widths off."""
@@ -197,6 +202,7 @@ def test_intervals_hold_where_the_drive_is_late(delay, lag):
     assert identify_drive([simulated(rate=2000.0)], p=P).late == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "shake"), [(2e5, 1e-4), (4e4, 0.0), (1.2e5, 0.0)])
 def test_an_elasticity_behind_the_only_encoder_is_told_and_widens_the_inertia(stiffness, shake):
     """Of a shaken axis the inertia of the rigid model was three half-widths off."""
@@ -215,6 +221,7 @@ def test_cyclic_friction_is_no_elasticity(seed):
     assert identify_drive([prescribed(seed)]).elastic == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "rate"), [(0.0, 500.0), (0.0, 1000.0), (0.5, 1000.0), (2.0, 2000.0)])
 def test_a_drive_that_is_not_late_is_fitted_to_the_command_as_it_was_logged(noise, rate):
     """Noise of the record, which the loop had not, looked like a lag of up to four samples."""
@@ -230,6 +237,7 @@ def test_a_drive_that_is_not_late_is_fitted_to_the_command_as_it_was_logged(nois
         assert drive.refinement.symmetric.half_width("inertia") < 0.02
 
 
+@pytest.mark.slow
 def test_a_fit_that_runs_away_is_left_for_the_one_before_the_simulation():
     """A reference in steps of 10 ms shakes the motor alone; its simulated fit left what an axis can be."""
     p = 0.02 / (2.0 * math.pi)

@@ -65,6 +65,7 @@ def test_a_load_that_follows_in_another_way_is_told_so():
     assert math.isnan(shaft.delay)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shake", [0.0, 1e-4])
 def test_the_interval_contains_the_inertia_where_the_load_has_an_encoder_too(shake):
     # 11.4 +- 2.5 kg of 20 in the shaken log: an elasticity was looked for behind an only encoder.

@@ -60,6 +60,7 @@ def inside(drive):
     return [abs(fit[name] - value) / fit.half_width(name) for name, value in truth.items()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("belt", [{"creep": 2e-4}, {"creep": 1e-3}, {"sliding": 17.0}])
 def test_a_belt_that_slips_is_told_and_its_intervals_hold(belt):
     drive = identify_drive([recorded(**belt)])
@@ -68,6 +69,7 @@ def test_a_belt_that_slips_is_told_and_its_intervals_hold(belt):
     assert max(inside(drive)) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("healthy", [{}, {"warmth": 1e-4}, {"noise": 1e-6}, {"spot": (0.02, 0.03, 1.0)}])
 def test_a_belt_that_does_not_slip_is_not_said_to(healthy):
     drive = identify_drive([recorded(**healthy)])
@@ -75,6 +77,7 @@ def test_a_belt_that_does_not_slip_is_not_said_to(healthy):
     assert drive.shaft is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("begin", "end", "more"), [(0.02, 0.03, 0.6), (0.045, 0.055, 1.5)])
 def test_a_tight_spot_is_told_with_its_place_and_size(begin, end, more):
     told = identify_drive([recorded(spot=(begin, end, more), two=False)]).tight
@@ -85,6 +88,7 @@ def test_a_tight_spot_is_told_with_its_place_and_size(begin, end, more):
     assert numbers[2] == pytest.approx(100.0 * more, rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("even", [{}, {"noise": 1e-6}])
 def test_even_friction_has_no_tight_spot(even):
     assert identify_drive([recorded(**even, two=False)]).tight == ""
