@@ -8,6 +8,7 @@ import pytest
 from exploration import examples
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from scaling import AxisUnits, scaled_axis
 from typer.testing import CliRunner
 
 from servotwin.analysis.tuning import candidates
@@ -17,6 +18,7 @@ from servotwin.analysis.tuning.setpoint import overshoot, prefilter
 from servotwin.analysis.tuning.tune import Specification, evaluate, tune
 from servotwin.cli import app as cli
 from servotwin.control.controller import Controller
+from servotwin.design import tune as tune_plant
 from servotwin.errors import InvalidInput
 from servotwin.plant import linear, loop
 from servotwin.plant.axis import Axis
@@ -289,3 +291,15 @@ def test_the_release_time_is_that_of_the_new_loop_unless_it_is_stated(tmp_path, 
     tuned = Axis.from_file(new)
     assert tuned.pidf.Kp != axis.pidf.Kp
     assert tuned.pidf.release == (stated or pytest.approx(5.0 / 4.0, rel=1e-6))
+
+
+@pytest.mark.parametrize("time", [2.0**-10, 2.0**10])
+def test_margins_of_a_loop_with_a_delay_are_the_same_in_another_unit_of_time(time):
+    axis = Axis.preset("ball-screw")
+    slower = scaled_axis(axis, AxisUnits(time=time))
+    one, other = (
+        tune_plant(plant, 60.0 / unit, math.radians(55.0), delay=2e-4 * unit).margins
+        for plant, unit in ((axis, 1.0), (slower, time))
+    )
+    assert other.Ms == pytest.approx(one.Ms, rel=1e-9)
+    assert len(other.phase_crossovers) == len(one.phase_crossovers) > 1

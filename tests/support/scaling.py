@@ -59,6 +59,7 @@ _PLAIN = ("torque_per_command", "enter_tolerances", "leave_tolerances", "notch_d
 _DIMENSIONS: Mapping[str, tuple[int, int, int, int]] = {
     "inertia_kg_m2": (2, 0, 1, 0),
     "current_loop_time_s": (1, 0, 0, 0),
+    "velocity_loop_time_s": (1, 0, 0, 0),
     "viscous_friction_n_m_s_per_rad": (1, 0, 1, 0),
     "coulomb_friction_n_m": (0, 0, 1, 0),
     "resistance_ohm": (0, 0, 0, 1),
@@ -71,6 +72,7 @@ _DIMENSIONS: Mapping[str, tuple[int, int, int, int]] = {
     "damping_n_s_per_m": (1, -2, 1, 0),
     "mass_kg": (2, -2, 1, 0),
     "friction_n": (0, -1, 1, 0),
+    "friction_n_m": (0, 0, 1, 0),
     "position_resolution_m": (0, 1, 0, 0),
     "encoder_resolution_rad": (0, 0, 0, 0),
     "kp_n_m_per_m": (0, -1, 1, 0),

@@ -19,7 +19,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.linear import LinearSystem, feedback, gain, series
 from servotwin.plant.loop import pidf
-from servotwin.plant.margins import Margins, margins, margins_of_response
+from servotwin.plant.margins import Margins, gain_crossovers, margins, margins_of_response, search_frequencies
 
 # Candidates whose Ms is this close to the smallest count as equal, and the largest Ki wins.
 _EQUAL = 1.01
@@ -158,10 +158,16 @@ def evaluate(system: LinearSystem | FrequencyData, controller: Controller, delay
         loop = series(law, system)
         return margins(loop, feedback(loop, gain(1.0)))
     plant = Plant(system, delay)
-    at_one = plant.search_frequencies(1.0)
-    omega = plant.search_frequencies(
-        float(at_one[np.argmin(np.abs(np.log(np.abs(law.response(at_one) * plant.response(at_one)))))])
-    )
+    omega = plant.search_frequencies(_crossover(law, system) if isinstance(system, LinearSystem) else 1.0)
     loops = law.response(omega) * plant.response(omega)
     stable = bool(nyquist_stable(loops[None, :], plant.integrators + (controller.Ki != 0.0))[0])
     return margins_of_response(lambda w: np.asarray(law.response(w) * plant.response(w)), omega, stable)
+
+
+def _crossover(law: LinearSystem, system: LinearSystem) -> float:
+    """Highest gain crossover, rad/s, which no delay moves; without one the frequency at which the gain is nearest 1."""
+    loop = series(law, system)
+    if found := gain_crossovers(loop):
+        return found[-1].omega
+    omega = search_frequencies(loop)
+    return float(omega[np.argmin(np.abs(np.log(np.abs(loop.response(omega)))))])

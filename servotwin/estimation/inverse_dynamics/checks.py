@@ -10,7 +10,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion
-from servotwin.estimation.inverse_dynamics.fit import ParameterFit, Rows
+from servotwin.estimation.inverse_dynamics.fit import ParameterFit, Rows, solved
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, Mask
 from servotwin.plant.signals import Array
@@ -103,7 +103,7 @@ class _PartFit(NamedTuple):
 
 
 def _fit_of(design: Array, force: Array) -> _PartFit:
-    values = np.linalg.lstsq(design, force, rcond=None)[0]
+    values = solved(design, force)
     return _PartFit(float(values[0]), float(np.linalg.norm(force - design @ values)))
 
 

@@ -38,7 +38,7 @@ from servotwin.simulation import simulate
 
 FittedLaw = FittedCascade | FittedPid
 _ROUNDS, _LATE_ROUNDS = 8, 12
-_CONVERGED = 1e-3  # relative change of inertia and Coulomb friction, of the force
+_CONVERGED = 1e-3  # relative change of the inertia's force; of the others' also relative to Coulomb friction
 _RESTS, _LEAST_LAG = 0.1, 0.01  # samples: change of the lag, least lag
 _TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
 
@@ -153,10 +153,10 @@ def refine(
         if not simulated.position_error < _TRACKS:
             return None
         motion = motion_of(simulated.position, recording.rate, band)
-        both = fit_models(_rows(recording, motion, band, cycle, fit, simulated), DELAY if late else ())
+        rows = _rows(recording, motion, band, cycle, fit, simulated)
+        both = fit_models(rows, DELAY if late else ())
         symmetric, asymmetric = both[0].only(SYMMETRIC), both[1].only(ASYMMETRIC)
-        change = np.abs(symmetric.values - fit.values)
-        converged = bool(np.all(change < _CONVERGED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
+        converged = _rests(fit, symmetric, rows)
         slower = both[0]["delay"] if late else 0.0
         converged = converged and abs(slower) <= _RESTS / recording.rate
         found, fit = Refinement(symmetric, asymmetric, simulated, converged, lag), symmetric
@@ -166,6 +166,14 @@ def refine(
             break
         lag = max(lag + slower, _LEAST_LAG / recording.rate) if late else 0.0
     return found
+
+
+def _rests(before: ParameterFit, now: ParameterFit, rows: Rows) -> bool:
+    """If no parameter changes the force that it makes by much."""
+    sizes = np.linalg.norm(rows.design[:, : len(SYMMETRIC)], axis=0)
+    forces, changes = sizes * np.abs(before.values), sizes * np.abs(now.values - before.values)
+    forces[1:] = np.maximum(forces[1:], forces[SYMMETRIC.index("coulomb")])
+    return bool(np.all(changes < _CONVERGED * forces))
 
 
 def _rows(

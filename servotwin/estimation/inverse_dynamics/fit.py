@@ -42,7 +42,7 @@ class ParameterFit:
     relative_error : float
         Norm of what the model leaves over that of the force, both filtered.
     condition : float
-        Of the regressors' matrix.
+        Of the regressors' matrix, its columns of norm 1.
     rows : int
     """
 
@@ -167,7 +167,7 @@ def widened(fit: ParameterFit, other: ParameterFit, share: float = 1.0) -> Param
 def _blocks(times: Array, cycle: float, rows: Array) -> Groups:
     """Number of each row's block: whole cycles of motion, longer than errors hang together."""
     design, force = rows[:, : len(SYMMETRIC)], rows[:, -1]
-    left = force - design @ np.linalg.lstsq(design, force, rcond=None)[0]
+    left = force - design @ solved(design, force)
     step = float(np.median(np.diff(times)))
     wanted = max(cycle, 5.0 * step * correlation_length(left))
     count = int(np.clip(times.size * step / wanted, _FEWEST, _MOST))
@@ -208,10 +208,10 @@ def least_squares(names: tuple[str, ...], design: Array, rows: Rows) -> Paramete
     spot): the covariance is the sum of both, on the safe side of that for two-way clusters (Cameron, Gelbach and Miller
     2011). A bootstrap that draws blocks may draw none at another speed, and is singular then; leaving out one is not.
     """
-    scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
-    values = scale * np.linalg.lstsq(design * scale, rows.force, rcond=None)[0]
+    scale = _scale(design)
+    values = solved(design, rows.force)
     left = rows.force - design @ values
-    singular = np.linalg.svd(design, compute_uv=False)
+    singular = np.linalg.svd(design * scale, compute_uv=False)
     parts = [_left_out(design * scale, rows.force, groups) for groups in (rows.blocks, rows.places)]
     # Degrees of freedom of a sum of variances (Welch and Satterthwaite).
     variances = np.array([np.diag(each) for each in parts])
@@ -226,6 +226,17 @@ def least_squares(names: tuple[str, ...], design: Array, rows: Rows) -> Paramete
         float(singular[0] / max(singular[-1], np.finfo(float).tiny)),
         rows.force.size,
     )
+
+
+def solved(design: Array, force: Array) -> Array:
+    """(p,) least squares of a force on (r, p) columns, whatever their units: none counts as 0 for being small."""
+    scale = _scale(design)
+    return np.asarray(scale * np.linalg.lstsq(design * scale, force, rcond=None)[0])
+
+
+def _scale(design: Array) -> Array:
+    """(p,) factors that make columns of norm 1."""
+    return np.asarray(1.0 / np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny))
 
 
 def _left_out(design: Array, force: Array, groups: Groups) -> Array:

@@ -10,11 +10,12 @@ from scipy import optimize, signal
 
 from servotwin.control.linear_law import LOAD, MOTOR
 from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics.fit import solved
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.plant.signals import Array
 
 _LEAST_FILTER, _LONGEST_FILTER = 0.1, 50.0  # samples
-_RESET, _LONGEST_RESET = 0.05, 10.0  # s to begin with; logarithm
+_RESETS, _APART = 12, 0.3  # integral times tried first, from a sample to the log's length; logarithm
 _NONE = 1e3  # in place of the residual of gains of the wrong sign
 RICHER = 0.8
 """Of a simpler law's residual: a richer one must do better."""
@@ -136,13 +137,16 @@ def _fitted(recording: DriveRecording, given: GivenGains, integral: bool, on: st
     best = optimize.minimize_scalar(lambda x: min(law_of(x, None).left, _NONE), bounds=bounds, method="bounded")
     if not integral or given.integral_time is not None:
         return law_of(float(best.x), None)
+    resets = np.linspace(math.log(step), math.log(recording.duration), _RESETS)
+    start = np.array([float(best.x), min(resets, key=lambda x: law_of(float(best.x), x).left)])
     both = optimize.minimize(
         lambda x: (
-            min(law_of(*x).left, _NONE) if bounds[0] <= x[0] <= bounds[1] and abs(x[1]) < _LONGEST_RESET else _NONE
+            min(law_of(*x).left, _NONE) if bounds[0] <= x[0] <= bounds[1] and resets[0] <= x[1] <= resets[-1] else _NONE
         ),
-        np.array([float(best.x), math.log(_RESET)]),
+        start,
         method="Nelder-Mead",
-        options={"maxiter": 120, "xatol": 1e-3, "fatol": 1e-7},
+        # Without it the first steps are parts of the logarithms, which depend on the unit of time.
+        options={"maxiter": 120, "xatol": 1e-3, "fatol": 1e-7, "initial_simplex": start + _APART * np.eye(3, 2, -1)},
     )
     return law_of(*both.x)
 
@@ -167,7 +171,7 @@ def _with_gains(recording: DriveRecording, given: GivenGains, on: str) -> Fitted
     if Kv is not None:
         known, unknown = Kv * (unknown[:, 0] if Kp is not None else columns[:, 1]), columns[:, : 0 if Kp else 1]
     design = np.column_stack([unknown, constant])
-    fit = np.linalg.lstsq(design, force - known, rcond=None)[0] if design.shape[1] else np.empty(0)
+    fit = solved(design, force - known)
     left = force - known - design @ fit
     if Kv is None:
         Kv = float(fit[0] if Kp is not None else fit[1])

@@ -13,6 +13,8 @@ from servotwin.plant.signals import Array
 
 _WANTED = 0.02  # half of the 95 % interval, relative
 _STEPS = 400  # samples of a cycle
+_SLOW = 10.0  # cruise of a slow stroke, over the time to the highest speed
+_LONGEST = 1e7  # times that time
 _WORDS = {
     "inertia": "the inertia",
     "viscous": "the viscous friction",
@@ -71,10 +73,11 @@ def next_experiment(fit: ParameterFit, rows: Rows, motion: DriveMotion, unit: st
     # Errors hang together from row to row: the variance that explains the covariance found for this parameter.
     variance = float(fit.covariance[place, place] / np.linalg.inv(gram)[place, place])
     step = 1.0 / _rows_per_second(rows, motion)
+    fastest, sharpest = (float(np.quantile(np.abs(each), 0.99)) for each in (motion.speed, motion.acceleration))
     best = min(
         (
-            (_needed(fit, place, scale, information / (variance * step)), words)
-            for words, information in _motions(motion, unit)
+            (_needed(fit, place, scale, information / (variance * step), fastest / sharpest), words)
+            for words, information in _motions(fastest, sharpest, unit)
         ),
         key=lambda each: each[0],
     )
@@ -85,8 +88,8 @@ def _rows_per_second(rows: Rows, motion: DriveMotion) -> float:
     return rows.force.size / max(motion.seconds, np.finfo(float).tiny)
 
 
-def _needed(fit: ParameterFit, place: int, scale: Array, per_second: Array) -> float:
-    """Duration of a motion until half of a parameter's 95 % interval is 2 %, s."""
+def _needed(fit: ParameterFit, place: int, scale: Array, per_second: Array, shortest: float) -> float:
+    """Duration of a motion until half of a parameter's 95 % interval is 2 %, s, at least `shortest`."""
     now = np.linalg.inv(fit.covariance)
     wanted = _WANTED * scale[place] * fit.std(fit.names[place]) / fit.half_width(fit.names[place])
 
@@ -94,21 +97,19 @@ def _needed(fit: ParameterFit, place: int, scale: Array, per_second: Array) -> f
         total = np.linalg.inv(now + seconds * per_second)
         return bool(math.sqrt(total[place, place]) <= wanted)
 
-    seconds = 1.0
-    while not enough(seconds) and seconds < 1e6:
+    seconds = shortest
+    while not enough(seconds) and seconds < _LONGEST * shortest:
         seconds *= 1.25
     return seconds
 
 
-def _motions(motion: DriveMotion, unit: str) -> list[tuple[str, Array]]:
-    """Candidate motions in words, and the mean information of their regressors."""
-    fastest = float(np.quantile(np.abs(motion.speed), 0.99))
-    sharpest = float(np.quantile(np.abs(motion.acceleration), 0.99))
+def _motions(fastest: float, sharpest: float, unit: str) -> list[tuple[str, Array]]:
+    """Candidate motions in words up to a speed and an acceleration, and the mean information of their regressors."""
     slow = 0.05 * fastest
     speeds = (slow, 0.3 * fastest, fastest)
 
     def strokes(speed: float, acceleration: float, cruise: float) -> Array:
-        """Information of strokes to and fro that accelerate, cruise for some seconds and brake."""
+        """Information of strokes to and fro that accelerate, cruise for a time (s) and brake."""
         ramp = speed / acceleration
         time = np.linspace(0.0, 2.0 * ramp + cruise, _STEPS)
         profile = np.minimum(np.minimum(time, ramp), time[-1] - time) * acceleration
@@ -123,7 +124,7 @@ def _motions(motion: DriveMotion, unit: str) -> list[tuple[str, Array]]:
     )
     shown = ", ".join(f"{each:.2g}" for each in speeds)
     return [
-        (f"slow strokes to and fro at {slow:.2g} {unit}/s", strokes(slow, sharpest, 2.0)),
+        (f"slow strokes to and fro at {slow:.2g} {unit}/s", strokes(slow, sharpest, _SLOW * fastest / sharpest)),
         (f"long strokes to and fro at {fastest:.2g} {unit}/s", strokes(fastest, sharpest, 4.0 * fastest / sharpest)),
         (
             f"short strokes to and fro that accelerate at {sharpest:.2g} {unit}/s^2 throughout",
