@@ -11,6 +11,7 @@ import numpy as np
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.between_samples import error_between_samples, moved_between_samples
 from servotwin.estimation.output_error.bound import smallest_half
+from servotwin.estimation.output_error.carried import carried
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
@@ -189,6 +190,7 @@ def _doubts(
         _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
         _of_sharp_motion(sharp, allowed, unit),
+        carried(found) if half <= NORMAL_95 * total else "",
     )
     contact = 0.0 if any(doubts) else moved_by_contact(found)
     explained = math.hypot(total, friction.std, DOUBT * left, DOUBT * times.half, DOUBT * contact, DOUBT * sharp)
