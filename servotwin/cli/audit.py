@@ -249,13 +249,14 @@ class _Service:
 
     def require_sound(self) -> None:
         """Say the damage of the twin's store, where its health, which needs no token, tells any."""
-        damage = ""
+        damage, aside = "", dict[str, str]()
         with suppress(HTTPException, OSError, ValueError, LookupError, TypeError):
-            damage = jsons.loads(self._health() if self._answers else b"")["damage"]
-        if damage:
-            raise InvalidInput(
-                f"{self._url}: the twin's store is damaged ({damage}); call `servotwin twin check` there"
-            )
+            health = jsons.loads(self._health() if self._answers else b"")
+            damage, aside = health["damage"], health.get("set_aside", {})  # which an older twin does not have
+        if damage or aside:
+            what = "store" if damage else f"record of {' and '.join(aside)}"
+            why = damage or "; ".join(aside.values())
+            raise InvalidInput(f"{self._url}: the twin's {what} is damaged ({why}); call `servotwin twin check` there")
 
     def _health(self) -> bytes:
         try:

@@ -10,7 +10,7 @@ from servotwin.cli.output import progress_bar
 from servotwin.errors import InvalidInput
 from servotwin.store.backup import Progress as Report
 from servotwin.store.backup import RowCounts, backup, newest_of, restore
-from servotwin.twin_service.store_watch import lost_since
+from servotwin.twin_service.store_mark import lost_since
 from servotwin.twin_service.twin_file import service_of
 
 

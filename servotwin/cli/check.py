@@ -17,7 +17,7 @@ from servotwin.store.engine import POSTGRESQL, SQLITE, StoreUnavailable
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
-from servotwin.twin_service.store_watch import lost_messages
+from servotwin.twin_service.store_mark import lost_messages
 from servotwin.twin_service.twin_file import service_of
 
 _BODIES = 256
@@ -98,7 +98,11 @@ def _require_sound(store: Store, result: IntegrityReport) -> None:
                 f"store {store.name}: the disk does not give it ({error}); it need not be damaged: see to the disk, "
                 "its cables and the system's log, and check again"
             )
+        remedy = f"{_REMEDY[store.engines.writer.dialect.name]} and restore a backup"
+        if result.rows:
+            servos = ", ".join(sorted(str(row.servo) for row in result.rows))
+            remedy = f"rows of {servos}: put them right or delete them, as the operator's guide says, or {remedy}"
         raise InvalidInput(
-            f"store {store.name}: is damaged ({'; '.join(result.faults)}); {_REMEDY[store.engines.writer.dialect.name]}"
-            " and restore a backup: edges send again what they still keep"
+            f"store {store.name}: is damaged ({'; '.join(result.faults)}); {remedy}: edges send again what they still "
+            "keep"
         )

@@ -8,13 +8,14 @@ time. So messages are old by their numbers, which rise for ever, and not by thei
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import NamedTuple
 
 import sqlalchemy as sa
 
 from servotwin.store.engine import POSTGRESQL, transaction
 from servotwin.store.schema import messages
+from servotwin.store.set_aside import without
 from servotwin.store.store import Store
 
 _LONGEST_GAP = 0.1
@@ -63,9 +64,9 @@ def old_messages(store: Store, now: float, age: float) -> OldMessages:
     with transaction(store.engines.reader) as connection:
 
         def up_to(id_: int) -> _Receipt | None:
-            return _receipt(connection, _UP_TO, id_)
+            return _receipt(connection, _UP_TO, store.aside, id_)
 
-        first, last = (_receipt(connection, query) for query in (_FIRST, _LAST))
+        first, last = (_receipt(connection, query, store.aside) for query in (_FIRST, _LAST))
         elapsed, left_out, later = 0.0, 0.0, _Receipt(0, now)
         for receipt in () if first is None or last is None else _backwards(first, last, _RESOLUTION * longest, up_to):
             gap = max(0.0, later.received - receipt.received)
@@ -79,7 +80,7 @@ def old_messages(store: Store, now: float, age: float) -> OldMessages:
 def newest_receipt(store: Store) -> float:
     """Time at which the message with the highest number was received, s since the epoch; 0: there is none."""
     with transaction(store.engines.reader) as connection:
-        last = _receipt(connection, _LAST)
+        last = _receipt(connection, _LAST, store.aside)
     return 0.0 if last is None else last.received
 
 
@@ -133,8 +134,10 @@ def _last_before(old: _Receipt, later: _Receipt, time: float, up_to: Callable[[i
     return old.id
 
 
-def _receipt(connection: sa.Connection, query: sa.Select[tuple[int, float]], id_: int = 0) -> _Receipt | None:
-    row = connection.execute(query, {"_id": id_}).one_or_none()
+def _receipt(
+    connection: sa.Connection, query: sa.Select[tuple[int, float]], aside: Collection[str], id_: int = 0
+) -> _Receipt | None:
+    row = connection.execute(without(query, messages.c.servo, aside), {"_id": id_}).one_or_none()
     return None if row is None else _Receipt(row.id, row.received)
 
 

@@ -70,6 +70,10 @@ class StoreDamaged(StoreUnavailable):
     """Pages of the database are damaged. One sentence."""
 
 
+class ServoSetAside(StoreUnavailable):
+    """Rows of the servo are damaged: it is set aside, and the store works for all others. One sentence."""
+
+
 class StoreBusy(RuntimeError):
     """Too many messages wait to be committed, so that no more are accepted. One sentence."""
 

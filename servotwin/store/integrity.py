@@ -1,4 +1,4 @@
-"""IntegrityReport of a store: damaged pages, bodies that differ from their digests, messages that are gone."""
+"""IntegrityReport of a store: damaged pages, wrong values, bodies that differ from their digests, lost messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing
 from functools import partial
 from hashlib import blake2b
@@ -23,9 +23,10 @@ from servotwin.runtime.sqlite_damage import damage_words
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, is_damage, sqlite_file, transaction
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.postgresql_tables import table_faults
-from servotwin.store.schema import WINDOWS, bodies, messages, metadata
+from servotwin.store.schema import WINDOWS, bodies, messages, metadata, twins
+from servotwin.store.set_aside import without
 from servotwin.store.store import Store
-from servotwin.store.stored_value import wrong_value
+from servotwin.store.stored_value import WrongRow, wrong_row_of, wrong_rows
 
 log = logging.getLogger(__name__)
 
@@ -66,11 +67,15 @@ class IntegrityReport(NamedTuple):
         False where the time was over before everything was checked.
     checked : int
         Tables, or messages.
+    rows : tuple of WrongRow
+        Where nothing is wrong but rows of a few servos: one row of each. Empty: the faults concern all, or there are
+        none.
     """
 
     faults: tuple[str, ...] = ()
     complete: bool = True
     checked: int = 0
+    rows: tuple[WrongRow, ...] = ()
 
 
 def message_digest(data: bytes) -> bytes:
@@ -115,20 +120,27 @@ def check_pages(
         The PostgreSQL server does not answer.
     """
     if store.engines.writer.dialect.name == POSTGRESQL:
-        return IntegrityReport(*table_faults(store.engines.reader, seconds), len(metadata.tables))
+        try:
+            most = _few_of(store)
+        except StoreDamaged as error:
+            return IntegrityReport((str(error),), False)
+        faults, complete, wrong = table_faults(store.engines.reader, seconds, most + 1)
+        return _report(faults, complete, len(metadata.tables), wrong, most)
     file = sqlite_file(store.engines.writer.url)
     if file is None:
         return IntegrityReport()
     checked, until, check = 0, time.monotonic() + seconds, "integrity_check" if deep else "quick_check"
+    wrong, most = list[WrongRow](), 0
     try:
         with closing(_opened(file, lambda: time.monotonic() > until or ended())) as connection:
+            most = _few(connection.execute(str(_SERVOS)).fetchone()[0])
             for table in _TABLES:
                 rows = connection.execute(f"PRAGMA {check}('{table}')").fetchmany(_MOST_FAULTS)
                 faults = tuple(f"table {table}: {row[0].splitlines()[-1]}" for row in rows if row[0] != "ok")
-                if not faults and table in metadata.tables:
-                    faults = tuple(filter(None, [wrong_value(connection, metadata.tables[table])]))
                 if faults:
                     return IntegrityReport(faults, False, checked)
+                if table in metadata.tables:
+                    wrong += wrong_rows(connection, metadata.tables[table], most + 1)
                 checked += 1
     except sqlite3.Error as error:
         if is_damage(error):
@@ -136,12 +148,39 @@ def check_pages(
         # The time is over, or something passes: no free file descriptor, a locked file. The next check tells.
         if time.monotonic() < until:
             log.warning("store not checked", extra={"why": str(error)})
-        return IntegrityReport((), False, checked)
-    return IntegrityReport((), True, checked)
+        return _report((), False, checked, wrong, most)
+    return _report((), True, checked, wrong, most)
 
 
-def check_bodies(store: Store, after: int, most: int) -> tuple[IntegrityReport, int]:
+def _few_of(store: Store) -> int:
+    return _few(store.reading(lambda connection: connection.execute(_SERVOS).scalar_one()))
+
+
+def _few(servos: int) -> int:
+    """Number of servos, of so many, up to which wrong rows concern these alone: of 10, 3; of 1000, 9.
+
+    What changes a value here and there hits few of many; what hits more is at work everywhere. Of one servo none.
+    """
+    return max(0, servos.bit_length() - 1)
+
+
+def _report(
+    faults: tuple[str, ...], complete: bool, checked: int, wrong: Iterable[WrongRow], most: int
+) -> IntegrityReport:
+    """Report of faults of the store and of wrong rows, which concern their servos alone where those are `most`."""
+    rows = list(wrong)
+    told = (*faults, *(row.clause for row in rows))[:_MOST_FAULTS]
+    first_of = {row.servo: row for row in reversed(rows)}
+    apart = not faults and None not in first_of and len(first_of) <= most
+    if rows and not apart:
+        return IntegrityReport(told, False, checked)
+    return IntegrityReport(told, complete, checked, tuple(first_of.values()) if apart else ())
+
+
+def check_bodies(store: Store, after: int, most: int, aside: Collection[str] = ()) -> tuple[IntegrityReport, int]:
     """Compare the bodies of messages with their digests, from the one that follows the id `after`.
+
+    Those of the servos `aside` are left out; `rows` has those that differ, of however many servos.
 
     Returns
     -------
@@ -150,16 +189,19 @@ def check_bodies(store: Store, after: int, most: int) -> tuple[IntegrityReport, 
     """
     try:
         with transaction(store.engines.reader) as connection:
-            rows = connection.execute(_BODIES, {"_after": after, "_most": most}).all()
+            query = without(_BODIES, messages.c.servo, aside)
+            rows = connection.execute(query, {"_after": after, "_most": most}).all()
     except StoreDamaged as error:
         return IntegrityReport((str(error),), False), after
-    faults = [fault for row in rows if (fault := body_fault(*row))]
-    result = IntegrityReport(tuple(faults[:_MOST_FAULTS]), len(rows) < most, len(rows))
+    wrong = tuple(WrongRow(row.servo, fault, row.id) for row in rows if (fault := body_fault(*row)))
+    faults = tuple(row.clause for row in wrong[:_MOST_FAULTS])
+    result = IntegrityReport(faults, len(rows) < most, len(rows), wrong)
     return result, rows[-1].id if rows else after
 
 
 def check_all(store: Store, seconds: float, ended: Callable[[], bool] = lambda: False) -> IntegrityReport:
-    """Check files, pages and bodies of a store that was found damaged; `complete` where all of it is sound.
+    """Check files, pages and bodies of a store that was found damaged; `complete` where all was checked, and all of it
+    is sound, or all but `rows`.
 
     Parameters
     ----------
@@ -173,18 +215,44 @@ def check_all(store: Store, seconds: float, ended: Callable[[], bool] = lambda: 
     StoreUnavailable
         The store does not answer.
     """
+    report = IntegrityReport()
     for check in (partial(check_files, store), partial(check_pages, store, seconds, True, ended)):
         report = check()
-        if report.faults or not report.complete:
+        if not report.complete or (report.faults and not report.rows):
             return report
     store.engines.reader.dispose()  # its connections may hold pages as they were read when the store was damaged
-    after, checked = 0, 0
+    most = _few_of(store)
+    wrong, after, checked = {row.servo: row for row in report.rows}, 0, 0
     while not ended():
-        report, after = check_bodies(store, after, _BODIES_AT_ONCE)
+        report, after = check_bodies(store, after, _BODIES_AT_ONCE, [row.servo for row in wrong.values() if row.servo])
         checked += report.checked
-        if report.faults or report.complete:
-            return report._replace(checked=checked)
+        wrong = {row.servo: row for row in reversed(report.rows)} | wrong
+        if report.complete or len(wrong) > most or (report.faults and not report.rows):
+            faults = () if report.rows else report.faults
+            return _report(faults, report.complete, checked, wrong.values(), most)
     return IntegrityReport((), False, checked)
+
+
+def fault_of_servo(store: Store, found: WrongRow) -> str:
+    """First fault of the rows of a servo of which one was found wrong, that one first; empty: they are sound.
+
+    Raises
+    ------
+    StoreUnavailable
+    """
+    try:
+        with transaction(store.engines.reader) as connection:
+            of_servo = STORED_BODIES.where(messages.c.servo == found.servo)
+            faults = (body_fault(*row) for row in connection.execute(of_servo.where(messages.c.id == found.message)))
+            if fault := next(filter(None, faults), ""):
+                return fault
+            for table in metadata.sorted_tables:
+                if "servo" in table.columns and (wrong := wrong_row_of(connection, table, str(found.servo))):
+                    return wrong.clause
+            with connection.execution_options(yield_per=_BODIES_AT_ONCE).execute(of_servo) as rows:
+                return next(filter(None, (body_fault(*row) for row in rows)), "")
+    except StoreDamaged as error:  # a body that is no bytes
+        return str(error)
 
 
 def read_error(store: Store) -> str:
@@ -207,6 +275,7 @@ def read_error(store: Store) -> str:
 
 def missing_windows(store: Store, servo: str, boot: str, newest: int = 256) -> list[tuple[int, int]]:
     """Ranges of sequences, both included, that are missing among the newest windows of a boot."""
+    store.require_sound(servo)
     with transaction(store.engines.reader) as connection:
         rows = connection.execute(_NEWEST, {"_servo": servo, "_newest": newest}).all()
         sequences = {row.sequence for row in rows if row.boot == boot}
@@ -254,6 +323,7 @@ STORED_BODIES = (
 )
 """Arguments of `body_fault` for each stored body."""
 _BODIES = STORED_BODIES.where(bodies.c.message > sa.bindparam("_after")).limit(sa.bindparam("_most"))
+_SERVOS = sa.select(sa.func.count()).select_from(twins)
 _NEWEST = (
     sa.select(messages.c.boot, messages.c.sequence)
     .where(WINDOWS, messages.c.servo == sa.bindparam("_servo"))

@@ -16,6 +16,7 @@ import sqlalchemy as sa
 from servotwin.store.records import LONGEST_WAKE_S, Lease, MessageKind, StoredMessage
 from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, messages, states, twins
+from servotwin.store.set_aside import without
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
@@ -39,8 +40,9 @@ def acquire(
     kinds: Collection[MessageKind],
     only: str | None,
     estimate_first: bool = False,
+    aside: frozenset[str] = frozenset(),
 ) -> list[Turn]:
-    """Lease the servos of the first queue in which some wait.
+    """Lease the servos of the first queue in which some wait, those `aside` excepted.
 
     Of those with new messages the ones that have waited longest; servos due to be woken get at least half of the
     places, and a single place goes to the servo that has waited longest for either. Of estimates one servo.
@@ -48,7 +50,7 @@ def acquire(
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     late = now + 2.0 * max(until - now, LONGEST_HOLD_S)
     bound = {"_now": now, "_late": late, "_ahead": _ahead(now)} | ({} if only is None else {"_only": only})
-    new, estimates, backlogs = _queues(frozenset(kinds), only is not None)
+    new, estimates, backlogs = _queues(frozenset(kinds), only is not None, aside)
     order = [(new, limit, False), (estimates, 1, True), (backlogs, limit, False)]
     for queues, most, estimate in [order[1], *order] if estimate_first else order:
         granted = {"_owner": owner, "_until": until}
@@ -95,10 +97,13 @@ def _taken_alone(
     return [oldest.servo]
 
 
-def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
-    """End an owner's leases: all of them, or those of some servos."""
+def release(
+    connection: sa.Connection, owner: str, servos: Collection[str] | None = None, aside: Collection[str] = ()
+) -> None:
+    """End an owner's leases: all of them, but for those `aside`, or those of some servos."""
     if servos is None:
-        servos = connection.scalars(sa.select(twins.c.servo).where(twins.c.lease_owner == owner)).all()
+        of_owner = sa.select(twins.c.servo).where(twins.c.lease_owner == owner)
+        servos = connection.scalars(without(of_owner, twins.c.servo, aside)).all()
     _CHANGE.run(connection, _changes(owner, servos, None, None))
 
 
@@ -154,19 +159,25 @@ _Queue = tuple[sa.Select[Any], float]
 
 
 @lru_cache(maxsize=32)
-def _queues(kinds: frozenset[MessageKind], one: bool) -> tuple[list[_Queue], list[_Queue], list[_Queue]]:
+def _queues(
+    kinds: frozenset[MessageKind], one: bool, aside: frozenset[str]
+) -> tuple[list[_Queue], list[_Queue], list[_Queue]]:
     """Queues of new messages, which share the places, of estimates, and of backlogs; of `one` servo only."""
+
+    def next_of(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float]) -> sa.Select[Any]:
+        return without(_next(turn, order, one), twins.c.servo, aside)
+
     new, estimates, backlogs = list[_Queue](), list[_Queue](), list[_Queue]()
     if kinds - {MessageKind.VERIFICATION}:
         due, ready, estimate = _IS_DUE, twins.c.ready <= _NOW, twins.c.estimate_ready.is_not(None)
         # Half of the places at most before those with messages, the rest after them: neither queue can starve the
         # other.
-        woken = _next(due, twins.c.wake, one)
-        new += [(woken, 0.5), (_next(ready, twins.c.ready, one), 1.0), (woken, 1.0)]
-        estimates.append((_next(estimate, twins.c.estimate_ready, one), 1.0))
-        backlogs.append((_next(twins.c.ready.is_not(None), twins.c.ready, one), 1.0))
+        woken = next_of(due, twins.c.wake)
+        new += [(woken, 0.5), (next_of(ready, twins.c.ready), 1.0), (woken, 1.0)]
+        estimates.append((next_of(estimate, twins.c.estimate_ready), 1.0))
+        backlogs.append((next_of(twins.c.ready.is_not(None), twins.c.ready), 1.0))
     if MessageKind.VERIFICATION in kinds:
-        new.append((_next(twins.c.verification_ready.is_not(None), twins.c.verification_ready, one), 1.0))
+        new.append((next_of(twins.c.verification_ready.is_not(None), twins.c.verification_ready), 1.0))
     return new, estimates, backlogs
 
 

@@ -10,6 +10,7 @@ import sqlalchemy as sa
 from servotwin.store.queries import evidence_columns, evidence_of_row, servo_summaries
 from servotwin.store.records import ServoSummary, StoredEvidence, StoredWindow
 from servotwin.store.schema import WINDOWS, evidence, messages, twins
+from servotwin.store.set_aside import without
 
 _ESTIMATES = ("glance", "estimate")
 _NEWEST = ("trend",)
@@ -228,7 +229,12 @@ def _alarms() -> sa.Select[Any]:
 _ALARMS = _alarms()
 
 
-def names_after(connection: sa.Connection, after: str, limit: int) -> Sequence[str]:
-    """Names of the servos that follow `after`."""
-    query = sa.select(twins.c.servo).where(twins.c.servo > after).order_by(twins.c.servo).limit(limit)
+def names_after(connection: sa.Connection, after: str, limit: int, aside: Collection[str] = ()) -> Sequence[str]:
+    """Names of the servos that follow `after`, but for those `aside`."""
+    query = (
+        without(sa.select(twins.c.servo), twins.c.servo, aside)
+        .where(twins.c.servo > after)
+        .order_by(twins.c.servo)
+        .limit(limit)
+    )
     return list(connection.scalars(query))

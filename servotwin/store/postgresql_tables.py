@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from servotwin.store.engine import StoreDamaged, StoreUnavailable, transaction
 from servotwin.store.schema import metadata
-from servotwin.store.stored_value import wrong_content
+from servotwin.store.stored_value import WrongRow, wrong_contents
 
 _BY_INDEX = ("enable_indexscan", "enable_indexonlyscan")
 _BY_TABLE = ("enable_seqscan", "enable_sort")
@@ -26,7 +26,7 @@ _CANCELED = "57014"
 _LEAST_MS = 1
 
 
-def table_faults(engine: sa.Engine, seconds: float) -> tuple[tuple[str, ...], bool]:
+def table_faults(engine: sa.Engine, seconds: float, most: int) -> tuple[tuple[str, ...], bool, list[WrongRow]]:
     """Read all rows and indexes, look for rows that refer to rows which are gone, and count both; for a bounded time.
 
     A page of zeros is an empty page to PostgreSQL, with checksums too: the rows of such a page are gone unsaid. An
@@ -34,8 +34,8 @@ def table_faults(engine: sa.Engine, seconds: float) -> tuple[tuple[str, ...], bo
 
     Returns
     -------
-    tuple of str, bool
-        Faults, and True where everything was checked.
+    tuple of str, bool, list of WrongRow
+        Faults, True where everything was checked, and rows with wrong values, of `most` servos in each table.
 
     Raises
     ------
@@ -48,19 +48,17 @@ def table_faults(engine: sa.Engine, seconds: float) -> tuple[tuple[str, ...], bo
         with transaction(engine.execution_options(isolation_level="REPEATABLE READ")) as connection:
             known = set(sa.inspect(connection).get_table_names())
             missing = tuple(f"table {name}: is missing" for name in metadata.tables if name not in known)
-            faults = (
-                missing
-                or _wrong_columns(connection)
-                or _wrong_contents(connection)
-                or _lost_references(connection, until)
-            )
-            return faults or _lost_rows(connection, until), True
+            faults = missing or _wrong_columns(connection)
+            if faults:
+                return faults, True, []
+            wrong = [row for table in metadata.sorted_tables for row in wrong_contents(connection, table, most)]
+            return _lost_references(connection, until) or _lost_rows(connection, until), True, wrong
     except StoreDamaged as error:
-        return (str(error),), False
+        return (str(error),), False, []
     except StoreUnavailable as error:
         if getattr(error.__cause__, "sqlstate", None) != _CANCELED:
             raise
-        return (), False
+        return (), False, []
 
 
 def _wrong_columns(connection: sa.Connection) -> tuple[str, ...]:
@@ -75,10 +73,6 @@ def _wrong_columns(connection: sa.Connection) -> tuple[str, ...]:
             if there != made:
                 faults.append(f"column {table.name}.{column.name} is of type {there}, and was made as {made}")
     return tuple(faults)
-
-
-def _wrong_contents(connection: sa.Connection) -> tuple[str, ...]:
-    return tuple(filter(None, (wrong_content(connection, table) for table in metadata.sorted_tables)))
 
 
 def _lost_references(connection: sa.Connection, until: float) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from servotwin.store.records import (
 )
 from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, evidence, messages, twins
 from servotwin.store.schema import contexts as context_table
+from servotwin.store.set_aside import without
 
 _ESTIMATES = ("glance", "estimate")
 _ANSWERS = ("receipt", "fallback")
@@ -31,26 +32,33 @@ _EVENTS = ("hello", "fallback", "answer", "act")
 _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
 
 
-def backlog(connection: sa.Connection, now: float) -> Backlog:
-    """Number, age and lag of the unprocessed messages."""
-    counts = [sa.select(sa.func.count()).select_from(messages).where(queue) for queue in (WORK, VERIFICATIONS)]
-    firsts = [sa.select(sa.func.min(turn)).where(turn.is_not(None)) for turn in (twins.c.ready, twins.c.estimate_ready)]
-    query = sa.select(*(each.scalar_subquery() for each in (*counts, *firsts)), _OLDEST)
+def backlog(connection: sa.Connection, now: float, aside: Collection[str] = ()) -> Backlog:
+    """Number, age and lag of the unprocessed messages, but for those of servos `aside`."""
+    counted, first = sa.select(sa.func.count()).select_from(messages), sa.select(sa.func.min(messages.c.id)).where(WORK)
+    counts = [without(counted.where(queue), messages.c.servo, aside) for queue in (WORK, VERIFICATIONS)]
+    firsts = [_first_turn(turn, aside) for turn in (twins.c.ready, twins.c.estimate_ready)]
+    first_id = without(first, messages.c.servo, aside).scalar_subquery()
+    oldest_of = sa.select(messages.c.received).where(messages.c.id == first_id)
+    query = sa.select(*(each.scalar_subquery() for each in (*counts, *firsts, oldest_of)))
     row: Any = connection.execute(query).one()
     work, verifications, *turns, oldest = row
     age, *lags = (0.0 if since is None else max(0.0, now - since) for since in (oldest, *turns))
     return Backlog(work, verifications, age, max(lags))
 
 
-def turn_lag(connection: sa.Connection, now: float) -> float:
+def turn_lag(connection: sa.Connection, now: float, aside: Collection[str] = ()) -> float:
     """Longest time (s) for which new messages of a servo have waited for its turn; backlogs have theirs later."""
-    first = connection.scalar(sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None)))
+    first = connection.scalar(_first_turn(twins.c.ready, aside))
     return 0.0 if first is None else max(0.0, now - first)
 
 
-def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSummary]:
-    """Summaries by name."""
-    query = _SUMMARY.where(twins.c.servo > after).order_by(twins.c.servo).limit(limit)
+def _first_turn(turn: sa.Column[float], aside: Collection[str]) -> sa.Select[Any]:
+    return without(sa.select(sa.func.min(turn)).where(turn.is_not(None)), twins.c.servo, aside)
+
+
+def servos(connection: sa.Connection, after: str, limit: int, aside: Collection[str] = ()) -> list[ServoSummary]:
+    """Summaries by name, but for servos `aside`."""
+    query = without(_SUMMARY, twins.c.servo, aside).where(twins.c.servo > after).order_by(twins.c.servo).limit(limit)
     return [ServoSummary(*row) for row in connection.execute(query)]
 
 
@@ -218,7 +226,4 @@ def _count(queue: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
     return counted.correlate(twins).scalar_subquery().label("waiting")
 
 
-_FIRST = sa.select(sa.func.min(messages.c.id)).where(WORK).scalar_subquery()
-_OLDEST = sa.select(messages.c.received).where(messages.c.id == _FIRST).scalar_subquery()
-"""Arrival of the oldest unprocessed window or letter."""
 _SUMMARY = sa.select(*(_count(WORK) if name == "waiting" else twins.c[name] for name in ServoSummary._fields))

@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import SQLITE, transaction
 from servotwin.store.schema import WINDOWS, bodies, evidence, messages
+from servotwin.store.set_aside import without
 from servotwin.store.store import Store
 
 _PAGES = 512
@@ -74,7 +75,8 @@ def delete_old_bodies(
 
 def _next(store: Store, after: int, through: int, batch: int) -> Sequence[Any]:
     with transaction(store.engines.reader) as connection:
-        return connection.execute(_OLD_WINDOWS, {"_after": after, "_through": through, "_batch": batch}).all()
+        query = without(_OLD_WINDOWS, messages.c.servo, store.aside)
+        return connection.execute(query, {"_after": after, "_through": through, "_batch": batch}).all()
 
 
 def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 from servotwin.store.records import MessageKind
-from servotwin.store.stored_value import TIME, Content, check_values
+from servotwin.store.stored_value import OWNER, TIME, Content, check_values
 
 REVISION = "0004"
 """Newest migration, which makes the tables below."""
@@ -75,6 +75,7 @@ bodies = sa.Table(
     metadata,
     sa.Column("message", _Id, sa.ForeignKey(messages.c.id), primary_key=True, autoincrement=False),
     sa.Column("body", sa.LargeBinary, nullable=False),
+    info={OWNER: "(SELECT messages.servo FROM messages WHERE messages.id = message)"},
 )
 
 contexts = sa.Table(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -14,6 +14,7 @@ from servotwin.store import outgoing as posting
 from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
     Engines,
+    ServoSetAside,
     StoreUnavailable,
     engines_of,
     lost_race,
@@ -38,6 +39,7 @@ from servotwin.store.records import (
     WorkResult,
 )
 from servotwin.store.schema import contexts
+from servotwin.store.stored_value import WrongRow
 
 WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.ACT)
 FLEET = "fleet"
@@ -64,11 +66,15 @@ class Store:
     ----------
     damaged : bool
         Set it where the database is found damaged: from then on everything that writes raises StoreUnavailable.
+    aside : mapping of str to WrongRow
+        Replace it where nothing is damaged but rows of these servos: from then on they have no turn, nothing of them is
+        written, methods that name one raise ServoSetAside, and those that are of all leave them out.
     """
 
     def __init__(self, engines: Engines) -> None:
         self.engines = engines
         self.damaged = False
+        self.aside: Mapping[str, WrongRow] = {}
 
     @property
     def name(self) -> str:
@@ -79,12 +85,25 @@ class Store:
         """Close every connection."""
         self.engines.dispose()
 
+    def sound(self, servos: Iterable[str]) -> list[str]:
+        """Those of some servos that are not set aside."""
+        return [servo for servo in servos if servo not in self.aside]
+
+    def require_sound(self, *servos: str) -> None:
+        """Raise ServoSetAside where one of these is set aside."""
+        for servo in servos if self.aside else ():
+            if servo in self.aside:
+                raise ServoSetAside(
+                    f"the twin's record of servo {servo!r} is damaged and set aside: its edge keeps its windows until "
+                    "that is put right"
+                )
+
     def put(self, items: Sequence[Incoming]) -> list[PutResult]:
         """Store messages in one transaction; returns the result of each.
 
         CONFLICT: another message with the same key is stored, and stays.
         """
-        return self._write(lambda connection: incoming.put(connection, items))
+        return self.write(items, (), 0.0)[0]
 
     def commit(self, work: Sequence[WorkResult], now: float) -> list[bool]:
         """Commit work results in one transaction; False for those that are void, as another one was committed before.
@@ -95,12 +114,13 @@ class Store:
             A result covers a message that is not an unprocessed one of its servo, or names an unknown context: nothing
             is written.
         """
-        return self._write(lambda connection: results.commit(connection, work, now))
+        return self.write((), work, now)[1]
 
     def write(
         self, items: Sequence[Incoming], work: Sequence[WorkResult], now: float
     ) -> tuple[list[PutResult], list[bool]]:
         """`put` and `commit` in one transaction."""
+        self.require_sound(*(item.servo for item in items), *(result.servo for result in work))
         return self._write(lambda c: (incoming.put(c, items), results.commit(c, work, now)))
 
     def lease(
@@ -138,7 +158,9 @@ class Store:
         """
         until = now + lease_s
         leased = self._write(
-            lambda c: leases.acquire(c, owner, limit, until, now, kinds, servo, estimate_first=estimate_first)
+            lambda c: leases.acquire(
+                c, owner, limit, until, now, kinds, servo, estimate_first=estimate_first, aside=frozenset(self.aside)
+            )
         )
         if not leased:
             return []
@@ -153,58 +175,67 @@ class Store:
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
-        self._write(lambda connection: leases.release(connection, owner, servos))
+        some = None if servos is None else self.sound(servos)
+        self._write(lambda connection: leases.release(connection, owner, some, self.aside))
 
     def renew(self, owner: str, servos: Collection[str], until: float) -> None:
         """Extend an owner's leases of some servos until a time, s since the epoch; those that it has lost stay lost."""
-        self._write(lambda connection: leases.renew(connection, owner, servos, until))
+        self._write(lambda connection: leases.renew(connection, owner, self.sound(servos), until))
 
     def hold(self, servo: str, until: float) -> None:
         """Let nobody lease a servo until a time, s since the epoch; does nothing where somebody has it."""
+        self.require_sound(servo)
         self._write(lambda connection: leases.hold(connection, servo, until))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first."""
+        self.require_sound(servo)
         return self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
 
     def post(self, sent: Mapping[str, bytes], now: float, above: int = 0) -> None:
         """Post a message to each of these edges, its serial above `above`; unknown servos are left out."""
+        self.require_sound(*sent)
         self._write(lambda connection: posting.post(connection, sent, now, above))
 
     def skip_to_serial(self, servo: str, serial: int) -> None:
         """Make the serial of the next message to the edge exceed `serial`."""
+        self.require_sound(servo)
         self._write(lambda connection: posting.skip_to_serial(connection, servo, serial))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
-        return self._read(lambda connection: posting.newest_serials(connection, servos))
+        return self._read(lambda connection: posting.newest_serials(connection, self.sound(servos)))
 
     def claim_of(self, servo: str) -> StoredClaim:
         """Newest claim of a servo's edge."""
+        self.require_sound(servo)
         return self._read(lambda connection: claim_of(connection, servo))
 
     def raise_claim(self, servo: str, new: StoredClaim, below: int, now: float) -> StoredClaim:
         """Store a claim where the servo's newest has a number below `below`; return the one that counts then."""
+        self.require_sound(servo)
         return self._write(lambda connection: raise_claim(connection, servo, new, below, now))
 
     def add_alarm(self, sentence: str, now: float, *servos: str) -> None:
         """Store an alarm about each of some servos, which belongs to no window."""
+        self.require_sound(*servos)
         self._write(lambda connection: add_alarm(connection, servos, sentence, now))
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""
-        return self._read(lambda connection: queries.backlog(connection, now))
+        return self._read(lambda connection: queries.backlog(connection, now, self.aside))
 
     def turn_lag(self, now: float) -> float:
         """Longest time (s) for which new messages of a servo have waited for a worker."""
-        return self._read(lambda connection: queries.turn_lag(connection, now))
+        return self._read(lambda connection: queries.turn_lag(connection, now, self.aside))
 
     def servos(self, after: str = "", limit: int = 1000) -> list[ServoSummary]:
         """Summaries of the servos whose names follow `after`, by name."""
-        return self._read(lambda connection: queries.servos(connection, after, limit))
+        return self._read(lambda connection: queries.servos(connection, after, limit, self.aside))
 
     def servo(self, name: str) -> ServoSummary | None:
         """Summary of one servo; None: it is unknown."""
+        self.require_sound(name)
         return self._read(lambda connection: queries.servo(connection, name))
 
     def fleet(self, name: str) -> str:
@@ -217,6 +248,7 @@ class Store:
 
     def window(self, servo: str, boot: str, sequence: int) -> StoredMessage | None:
         """A window with its body, which is empty once retention deleted it; None: it is unknown."""
+        self.require_sound(servo)
         return self._read(lambda connection: queries.window(connection, servo, boot, sequence))
 
     def audit(
@@ -243,6 +275,7 @@ class Store:
         updates : bool
             Only windows that led to an update.
         """
+        self.require_sound(servo)
         return self._read(lambda connection: queries.audit(connection, servo, since, limit, window, before, updates))
 
     def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[StoredEvidence]:
@@ -253,10 +286,12 @@ class Store:
         since : float
             s since the epoch: only evidence from then or later.
         """
+        self.require_sound(servo)
         return self._read(lambda connection: queries.events(connection, servo, since, limit))
 
     def windows(self, servo: str, limit: int = 100, before: int | None = None) -> list[StoredWindow]:
         """Windows without bodies, newest first."""
+        self.require_sound(servo)
         return self._read(lambda connection: queries.windows(connection, servo, limit, before))
 
     def contexts(self, keys: Collection[str]) -> dict[str, str]:

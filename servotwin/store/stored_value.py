@@ -85,38 +85,101 @@ class StoredValue(sa.TypeDecorator[Any]):
         return check
 
 
+class WrongRow(NamedTuple):
+    """A row with a value that does not belong there.
+
+    Attributes
+    ----------
+    servo : str or None
+        The servo to which the row belongs; None: it concerns others too.
+    clause : str
+        Names the value and the row.
+    message : int
+        Id of the message whose body it is; 0: it is no body.
+    """
+
+    servo: str | None
+    clause: str
+    message: int = 0
+
+
 def wrong_value(connection: sqlite3.Connection, table: sa.Table) -> str:
     """First value that does not belong into its column of an SQLite file, of any revision, in a clause; empty: none."""
+    return next((row.clause for row in wrong_rows(connection, table, 1)), "")
+
+
+def wrong_rows(connection: sqlite3.Connection, table: sa.Table, most: int) -> list[WrongRow]:
+    """Rows of an SQLite file, of any revision, with values that do not belong into their columns.
+
+    One row of each servo, of `most` servos at most. An earlier revision lacks some tables and columns.
+    """
     known = {row[1] for row in connection.execute(f"PRAGMA table_info('{table.name}')")}
     columns = [column for column in table.columns if column.name in known]
+    return _wrong_rows(connection.execute, table, columns, _typed(columns), most)
+
+
+def wrong_contents(connection: sa.Connection, table: sa.Table, most: int) -> list[WrongRow]:
+    """Rows of a PostgreSQL store with contents that do not belong into their columns, likewise."""
+    return _wrong_rows(_executing(connection), table, table.columns, _contents(table.columns), most)
+
+
+def wrong_row_of(connection: sa.Connection, table: sa.Table, servo: str) -> WrongRow | None:
+    """First row of a servo, in a table that names servos, with a value that does not belong there; None: none has."""
+    columns = list(table.columns)
+    wrong = _typed(columns) if connection.dialect.name == "sqlite" else _contents(columns)
+    return next(iter(_wrong_rows(_executing(connection), table, columns, wrong, 1, servo)), None)
+
+
+_Execute = Callable[[str, dict[str, Any]], Iterable[Any]]
+OWNER = "owner"
+"""Key of a table's `info` with the SQL for the servo of a row, where no column names it."""
+
+
+def _executing(connection: sa.Connection) -> _Execute:
+    return lambda query, bound: connection.execute(sa.text(query), bound)
+
+
+def _typed(columns: Iterable[sa.Column[Any]]) -> dict[str, str]:
+    """Conditions for wrong types and contents by the names of all columns, in SQLite."""
+    columns = list(columns)
     wrong = {column.name: f"typeof({column.name}) NOT IN {_STORED[_kind(column)]}" for column in columns}
-    for name, condition in _contents(columns).items():
-        wrong[name] += f" OR {condition}"
-    return _first_wrong(lambda query: connection.execute(query).fetchone(), table, wrong)
+    return wrong | {name: f"{wrong[name]} OR {condition}" for name, condition in _contents(columns).items()}
 
 
-def wrong_content(connection: sa.Connection, table: sa.Table) -> str:
-    """First value that does not belong into its column of a PostgreSQL store, in a clause; empty: there is none."""
-    return _first_wrong(lambda query: connection.execute(sa.text(query)).one_or_none(), table, _contents(table.columns))
+def _wrong_rows(
+    execute: _Execute,
+    table: sa.Table,
+    columns: Iterable[sa.Column[Any]],
+    wrong: Mapping[str, str],
+    most: int,
+    servo: str | None = None,
+) -> list[WrongRow]:
+    """Rows for which a column's condition holds, found in one pass over the table: of each servo the first one.
 
-
-def _first_wrong(first: Callable[[str], Any], table: sa.Table, wrong: Mapping[str, str]) -> str:
-    """Clause on the first value for which a column's condition holds, found in one pass over the table."""
+    A wrong key is nobody's alone, and comes first: whose row it was is not known.
+    """
     if not wrong:  # an earlier revision lacks some tables
-        return ""
+        return []
+    columns, keys = list(columns), tuple(table.primary_key)
+    shared = {each.name for each in keys} | {"servo"}
     cases = "".join(f" WHEN {condition} THEN '{name}'" for name, condition in wrong.items())
-    keys = tuple(table.primary_key)
-    names = ", ".join(each.name for each in keys)
-    found = first(
-        f"SELECT wrong, {names} FROM (SELECT *, CASE{cases} END AS wrong FROM {table.name}) AS checked "
-        "WHERE wrong IS NOT NULL LIMIT 1"
+    names = ", ".join(column.name for column in columns)
+    owner = "servo" if "servo" in table.columns else table.info.get(OWNER, "NULL")
+    only = "" if servo is None else f" WHERE {owner} = :servo"
+    rows = execute(
+        f"SELECT wrong, owner, {names} FROM (SELECT *, row_number() OVER (PARTITION BY owner "
+        f"ORDER BY wrong NOT IN ({', '.join(map(repr, sorted(shared)))}), {keys[0].name}) AS place FROM "
+        f"(SELECT *, {owner} AS owner FROM (SELECT *, CASE{cases} END AS wrong FROM {table.name}{only}) AS checked "
+        f"WHERE wrong IS NOT NULL) AS owned) AS placed WHERE place = 1 LIMIT {most}",
+        {} if servo is None else {"servo": servo},
     )
-    if found is None:
-        return ""
-    name, *key = found
-    column = table.columns[name]
-    value = first(f"SELECT {name} FROM {table.name} WHERE {wrong[name]} LIMIT 1")[0]
-    return f"{_clause(f'{table.name}.{name}', _kind(column), _content(column), value)}, in {row_name(keys, key)}"
+    found = []
+    for name, whose, *values in rows:
+        row, column = dict(zip(columns, values, strict=True)), table.columns[name]
+        clause = _clause(f"{table.name}.{name}", _kind(column), _content(column), row[column])
+        of_servo = whose if isinstance(whose, str) and name not in shared else None
+        found.append(WrongRow(of_servo, f"{clause}, in {row_name(keys, (row[key] for key in keys))}"))
+    return found
 
 
 def row_name(columns: Iterable[sa.Column[Any]], key: Iterable[Any]) -> str:

@@ -15,7 +15,7 @@ from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.limits import MAX_SERVOS, RequestRejected
+from servotwin.twin_service.limits import MAX_SERVOS, RequestRejected, unavailable
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
 
@@ -196,8 +196,8 @@ class EdgeClaims:
         at = self._clocks.monotonic()
         try:
             claim = await self._executor.run(partial(self._store.claim_of, servo))
-        except StoreUnavailable:
-            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
+        except StoreUnavailable as error:
+            raise unavailable(error, "the store cannot be read now") from None
         self._note(servo, claim, at)
         return claim
 
@@ -206,8 +206,8 @@ class EdgeClaims:
         at = self._clocks.monotonic()
         try:
             claim = await self._executor.run(lambda: call(now=self._clocks.wall()))
-        except StoreUnavailable:
-            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be written now") from None
+        except StoreUnavailable as error:
+            raise unavailable(error, "the store cannot be written now") from None
         if claim is None:
             return await self._newest(servo)
         self._note(servo, claim, at)

@@ -23,6 +23,7 @@ from servotwin.runtime.frames import frame, read_frame
 from servotwin.store.engine import StoreUnavailable, engines_of, parse_address
 from servotwin.store.overview import StorePosition
 from servotwin.store.store import Store
+from servotwin.store.stored_value import WrongRow
 from servotwin.twin_service.fleet_reader import FleetReader
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import StoreAddress, WorkerLost, WorkerProcess
@@ -48,6 +49,8 @@ class ChangesQuestion(NamedTuple):
         All others are not.
     part, most : int
         Rows of one part, and of all.
+    aside : tuple of str
+        Servos that are set aside.
     """
 
     since: StorePosition
@@ -56,6 +59,7 @@ class ChangesQuestion(NamedTuple):
     sole: bool = False
     part: int = 1000
     most: int = 8000
+    aside: tuple[str, ...] = ()
 
 
 class FleetChanges(NamedTuple):
@@ -127,7 +131,8 @@ class ChangeReader:
         if self._process is not None:
             try:
                 async with self._turn:
-                    found = _changes(await self._process.ask(_encode(question)))
+                    asked = question._replace(aside=tuple(self._reader.aside))
+                    found = _changes(await self._process.ask(_encode(asked)))
             except WorkerLost as lost:
                 log.warning("the process that reads changes was lost", extra={"why": str(lost)})
                 await self.stop()
@@ -186,6 +191,7 @@ def main(descriptor: int) -> None:
 
 
 def _answer(store: Store, question: ChangesQuestion) -> FleetChanges:
+    store.aside = {servo: WrongRow(servo, "") for servo in question.aside}
     connected, absent = frozenset(question.connected), False if question.sole else None
     reader = FleetReader(store, lambda servo: True if servo in connected else absent, time.time)
     try:

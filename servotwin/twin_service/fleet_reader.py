@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -12,6 +12,7 @@ from servotwin.dashboard.fleet import ALARMS_S, FleetRow, context_key, fleet_row
 from servotwin.store import overview, queries
 from servotwin.store.overview import StorePosition
 from servotwin.store.store import Store
+from servotwin.store.stored_value import WrongRow
 
 _CONTEXTS = 1000
 """Texts of contexts in memory."""
@@ -83,12 +84,17 @@ class FleetReader:
         self._store, self._presence, self._wall = store, presence, wall
         self._contexts: dict[str, str] = {}
 
+    @property
+    def aside(self) -> Mapping[str, WrongRow]:
+        """Servos that are set aside, whose rows are left out."""
+        return self._store.aside
+
     def page(self, after: str, limit: int) -> FleetPage:
         """Rows of the servos whose names follow `after`."""
 
         def read(connection: sa.Connection) -> FleetPage:
             position = overview.position(connection)  # before the rows: what changes meanwhile is sent once more
-            rows = self._rows(connection, overview.names_after(connection, after, limit))
+            rows = self._rows(connection, overview.names_after(connection, after, limit, self._store.aside))
             return FleetPage(rows, position, self._wall())
 
         return self._store.reading(read)
@@ -122,7 +128,7 @@ class FleetReader:
         return self._store.reading(read)
 
     def _rows(self, connection: sa.Connection, servos: Collection[str]) -> list[FleetRow]:
-        facts = overview.facts(connection, servos, self._wall() - ALARMS_S)
+        facts = overview.facts(connection, self._store.sound(servos), self._wall() - ALARMS_S)
         missing = {context_key(each) for each in facts} - self._contexts.keys() - {""}
         if missing:
             found = queries.contexts(connection, missing)

@@ -21,7 +21,7 @@ from servotwin.twin_service.http_edge import SERVO_PATH
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.http_operator import admitted_servo, store_query
 from servotwin.twin_service.http_server import BodyReader
-from servotwin.twin_service.limits import RateLimiter, RequestRejected
+from servotwin.twin_service.limits import RateLimiter, RequestRejected, unavailable
 from servotwin.twin_service.openapi import JSON, QUERY_ERRORS, SERVO, operation
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -109,8 +109,8 @@ class ActsApi:
             await self._put(
                 Incoming(servo, MessageKind.ACT, f"act {uuid4().hex}", body, "", message_digest(body), act.time)
             )
-        except (StoreBusy, StoreUnavailable):
-            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be written now: nothing was done") from None
+        except (StoreBusy, StoreUnavailable) as error:
+            raise unavailable(error, "the store cannot be written now: nothing was done") from None
         self._wake()
         return json_response({"act": act.act, "who": who}, 202, _FRESH)
 

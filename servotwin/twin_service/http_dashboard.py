@@ -248,7 +248,7 @@ class DashboardApi:
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"servos: give up to {_SPARK_SERVOS} names of servos")
 
         def read(connection: sa.Connection) -> dict[str, list[float | None]]:
-            return {name: _history(connection, name) for name in names}
+            return {name: _history(connection, name) for name in self._store.sound(names)}
 
         return _fresh(await store_query(self._executor, partial(self._store.reading, read)))
 

@@ -19,7 +19,7 @@ from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response, msgpack_response
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement
-from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.limits import RequestRejected, unavailable
 from servotwin.twin_service.openapi import (
     BOOT,
     CLAIM,
@@ -148,8 +148,8 @@ class LongPolls:
             return ()
         try:
             messages = await self._read(servo, after)
-        except StoreUnavailable:
-            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
+        except StoreUnavailable as error:
+            raise unavailable(error, "the store cannot be read now") from None
         # A message that was posted while the store was read may not be in what was read.
         if not messages and notifications == self._notifications[servo]:
             self._empty_after[servo] = after

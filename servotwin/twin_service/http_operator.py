@@ -20,7 +20,7 @@ from servotwin.store.store import Store
 from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
-from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.limits import RequestRejected, unavailable
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.openapi import (
     BOOT,
@@ -247,8 +247,8 @@ async def store_query(executor: StoreExecutor, call: Callable[[], _Result]) -> _
     """Result of a call that reads the store; raises RequestRejected where it cannot be read."""
     try:
         return await executor.run(call)
-    except StoreUnavailable:
-        raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
+    except StoreUnavailable as error:
+        raise unavailable(error, "the store cannot be read now") from None
 
 
 def trace_as_json(trace: WindowTrace) -> dict[str, Any]:

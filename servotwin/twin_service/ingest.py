@@ -25,7 +25,7 @@ from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.twin_service.backlog_pace import BacklogPace
-from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
+from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter, unavailable
 from servotwin.twin_service.monitoring import Metrics
 
 LETTERS = (Hello, Receipt, Fallback, Answer)
@@ -173,7 +173,9 @@ class Ingest:
         try:
             put = await self._put(incoming)
         except (StoreBusy, StoreUnavailable) as error:
-            raise RequestRejected(Refusal.UNAVAILABLE, _unavailable(error)) from None
+            busy = isinstance(error, StoreBusy)
+            detail = "too many messages wait to be committed" if busy else "the store cannot be written now"
+            raise unavailable(error, detail) from None
         finally:
             if self._disk is not None and put is not PutResult.NEW:
                 self._disk.give_back(incoming.servo, len(incoming.body))
@@ -226,8 +228,3 @@ def acknowledgement(window: WindowMessage) -> bytes:
 
 def _kind(message: Message) -> str:
     return type(message).__name__.lower()
-
-
-def _unavailable(error: Exception) -> str:
-    busy = isinstance(error, StoreBusy)
-    return "too many messages wait to be committed" if busy else "the store cannot be written now"

@@ -14,6 +14,7 @@ _WINDOWS, _UPDATES = 400, 50
 
 def report_of(store: Store, reader: FleetReader, servo: str) -> str | None:
     """Report of a machine as HTML; None: it has never sent a message."""
+    store.require_sound(servo)
     now = reader.now()
     rows = reader.rows([servo])
     if not rows:

@@ -271,7 +271,8 @@ class TwinService:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store = not self.watch.fault and not self._store_health.trouble
         workers, dispatching = self.pool.alive, self.dispatching
-        parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
+        parts = {"store": store, "damage": self.watch.fault, "set_aside": self.watch.aside}
+        parts |= {"workers": workers, "dispatching": dispatching}
         fault = "" if self.tokens is None else self.tokens.fault
         former = [f"the former tokens stay in force: {fault}"] if fault else []
         own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
@@ -373,8 +374,8 @@ class TwinService:
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.pages.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
-        damaged = "1: the store is damaged, and is not written any more."
-        add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
+        add("servotwin_store_damaged", "1: the store is damaged, and not written.", lambda: bool(self.watch.fault))
+        add("servotwin_servos_set_aside", "Servos whose record is damaged.", lambda: len(self.watch.aside))
         add("servotwin_store_checks", "Times that the whole store was checked.", lambda: self.watch.rounds)
         if (mqtt := self._mqtt) is not None:
             add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from servotwin.store.engine import StoreDamaged, StoreUnavailable
+from servotwin.store.engine import ServoSetAside, StoreDamaged, StoreUnavailable
 
 _Result = TypeVar("_Result")
 _THREADS = 4
@@ -27,14 +27,15 @@ class StoreExecutor:
     ----------
     fault : str
         Why the last call failed; empty: it succeeded.
-    damage : str
-        Damage that a call found; empty: none since it was last emptied.
+    damage : StoreDamaged or None
+        Damage that a call found; None: none since it was last set so.
     """
 
     def __init__(self, threads: int = _THREADS, name: str = "store") -> None:
         self._threads = ThreadPoolExecutor(threads, name)
         self._begun = dict[object, float]()
-        self.fault = self.damage = ""
+        self.fault = ""
+        self.damage: StoreDamaged | None = None
 
     @property
     def waited(self) -> float:
@@ -48,10 +49,12 @@ class StoreExecutor:
             self._begun[mark] = time.monotonic()
         try:
             result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
+        except ServoSetAside:
+            raise  # the store itself works
         except StoreUnavailable as error:
             self.fault = str(error)
             if isinstance(error, StoreDamaged):
-                self.damage = self.fault
+                self.damage = error
             raise
         finally:
             self._begun.pop(mark, None)

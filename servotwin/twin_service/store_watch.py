@@ -16,13 +16,14 @@ from servotwin.messages import Resend, encode
 from servotwin.messages.checks import LARGEST_REPORTED
 from servotwin.runtime.files import replace_file
 from servotwin.store.claims import LOST_ANSWERS
-from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, parse_address, sqlite_file
+from servotwin.store.engine import StoreDamaged, StoreUnavailable
 from servotwin.store.integrity import (
     IntegrityReport,
     check_all,
     check_bodies,
     check_files,
     check_pages,
+    fault_of_servo,
     newest_message,
     read_error,
 )
@@ -31,8 +32,10 @@ from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.schema import REVISION
 from servotwin.store.store import Store
+from servotwin.store.stored_value import WrongRow, WrongValue
 from servotwin.twin_service.limits import MAX_SERVOS
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_mark import loss, mark_file, read_mark
 
 log = logging.getLogger(__name__)
 
@@ -54,12 +57,15 @@ _AHEAD_S = 3600.0
 """s for which an edge that has had more than the store sent is not asked once more."""
 _MAX_SERIAL = LARGEST_REPORTED
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
-_MARK = "newest"
 _LOST = "the twin's store has lost messages"
+_ASIDE = "is set aside, and its edge keeps its windows, because its record is damaged"
 
 
 class StoreWatch:
     """Checks the store, and keeps a damaged one from being written.
+
+    Where a check of everything finds nothing wrong but rows of a few servos, it sets these aside, and the store is
+    written again for all others; their rows are looked at again and again, and those that are sound come back.
 
     Parameters
     ----------
@@ -91,7 +97,7 @@ class StoreWatch:
         beside: Path,
     ) -> None:
         self._store, self._executor = store, executor
-        self._mark_file = _mark_file(store, beside)
+        self._mark_file = mark_file(store, beside)
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
@@ -99,9 +105,19 @@ class StoreWatch:
         self._why, self._read_error = "", ""
         self.fault, self.lost, self.rounds = "", "", 0
         self._newer = ""
+        self._read_wrong, self._again = False, 0
+
+    @property
+    def aside(self) -> dict[str, str]:
+        """What is wrong with the rows of the servos that are set aside, by servo."""
+        return {servo: wrong.clause for servo, wrong in self._store.aside.items()}
 
     def sentences(self) -> list[str]:
-        """Return a sentence where a newer servotwin has migrated the store since this twin began."""
+        """Return a sentence for each servo that is set aside, and one where a newer servotwin migrated the store."""
+        aside = self.aside.items()
+        return [*(f"servo {servo!r} {_ASIDE}: {why}" for servo, why in aside), *self._newer_sentences()]
+
+    def _newer_sentences(self) -> list[str]:
         if not self._newer:
             return []
         return [
@@ -110,7 +126,7 @@ class StoreWatch:
         ]
 
     async def put(self, item: Incoming) -> PutResult:
-        """Commit a message, unless the store is damaged; raises StoreUnavailable."""
+        """Commit a message, unless the store is damaged, or its servo set aside; raises StoreUnavailable."""
         return await self._guarded(self._put, item)
 
     async def commit(self, result: WorkResult) -> bool:
@@ -118,10 +134,11 @@ class StoreWatch:
         return await self._guarded(self._commit, result)
 
     async def _guarded(self, write: Callable[[_Record], Awaitable[_Result]], record: _Record) -> _Result:
+        self._store.require_sound(record.servo)
         try:
             return await write(record)
         except StoreDamaged as error:
-            self._found(IntegrityReport((str(error),), False))
+            self._was_read(error)
             raise
 
     async def start(self) -> None:
@@ -149,12 +166,16 @@ class StoreWatch:
         pause = _RECHECK_S
         while True:
             await asyncio.sleep(_TELL_S)
-            if self._executor.damage:
-                self._found(IntegrityReport((self._executor.damage,), False))
+            if self._executor.damage is not None:
+                self._was_read(self._executor.damage)
+            begun = self._monotonic()
             if not self.fault:
                 pause = _RECHECK_S
+                if self._store.aside:
+                    with suppress(StoreUnavailable):
+                        await self._executor.run(self._look_aside, slow=True)
+                    await asyncio.sleep((self._monotonic() - begun) * (1.0 / _RECHECK_SHARE - 1.0))
                 continue
-            begun = self._monotonic()
             with suppress(StoreUnavailable):
                 await self.recheck(max(pause, _PAGES_S))
             if self.fault:
@@ -163,6 +184,8 @@ class StoreWatch:
 
     async def recheck(self, seconds: float) -> None:
         """Check everything of a damaged store, its pages for that time at most, s; where it is sound, go on.
+
+        Go on without a few servos where nothing else is wrong.
 
         Raises
         ------
@@ -181,17 +204,37 @@ class StoreWatch:
             if report.faults and report.faults[0] != self.fault:  # who reads finds a column, and this its row too
                 self.fault, self._why = report.faults[0], "; ".join(report.faults)
                 log.error("damage of the store", extra={"why": self._why})
-            if report.complete and not report.faults:
-                await self._executor.run(self._resume)
+            if report.complete and (not report.faults or self._can_go_on(report.rows)):
+                await self._executor.run(partial(self._resume, report.rows))
         finally:
             ended.set()  # where this task was cancelled, its thread still checks
 
-    def _resume(self) -> None:
-        """Write the store again, over connections that have read none of what was damaged."""
+    def _can_go_on(self, wrong: Sequence[WrongRow]) -> bool:
+        """True where the store works without these rows; not where they are read again although they are set aside.
+
+        Once is allowed in a round of checks: whoever began to read before they were set aside may end after that.
+        """
+        same = self._read_wrong and self._store.aside.keys() == {row.servo for row in wrong}
+        self._again = self._again + 1 if same else 0
+        return bool(wrong) and self._again <= 1
+
+    def _resume(self, wrong: Sequence[WrongRow] = ()) -> None:
+        """Write the store again but for the servos of wrong rows, over connections that have read nothing damaged."""
         self._store.engines.dispose()
-        self.fault, self._executor.damage, self._store.damaged = "", "", False
+        before, aside = self._store.aside, {str(row.servo): row for row in wrong}
+        self._store.aside = aside  # first: from here on nobody reads or writes those rows
+        self.fault, self._executor.damage, self._store.damaged, self._read_wrong = "", None, False, False
+        for servo in aside.keys() - before.keys():
+            log.error("servo set aside", extra={"servo": servo, "why": aside[servo].clause})
         log.warning("store sound again: it is written", extra={"after": self._why})
         self._compare_mark()
+
+    def _look_aside(self) -> None:
+        """Take back those servos whose rows are sound now."""
+        for servo, wrong in self._store.aside.items():
+            if not fault_of_servo(self._store, wrong):
+                self._store.aside = {name: row for name, row in self._store.aside.items() if name != servo}
+                log.warning("servo sound again", extra={"servo": servo, "after": wrong.clause})
 
     async def run_mark(self) -> None:
         """Note the newest message beside the store every few seconds, and look at the store's schema."""
@@ -214,12 +257,15 @@ class StoreWatch:
                     for servo in await self._executor.run(self._ask_for_windows):
                         notify(servo)
 
-    async def tell(self, announce: Callable[[str, str], None]) -> None:
-        """Announce, once, that the store has lost messages, is damaged, or is of a newer servotwin."""
-        told, damage, newer = "", "", list[str]()
+    async def tell(self, announce: Callable[..., None]) -> None:
+        """Announce, once, that the store has lost messages, is damaged or of a newer servotwin, or lacks a servo."""
+        told, damage, newer, aside = "", "", list[str](), frozenset[str]()
         while True:
-            if self.sentences() != newer:
-                newer = self.sentences()
+            for servo in sorted(self.aside.keys() - aside):
+                announce("servo set aside", f"the servo {_ASIDE}: {self.aside[servo]}", servo)
+            aside = frozenset(self.aside)
+            if self._newer_sentences() != newer:
+                newer = self._newer_sentences()
                 for sentence in newer:
                     log.error("store of a newer servotwin", extra={"why": sentence})
                     announce("store of a newer servotwin", sentence)
@@ -277,14 +323,14 @@ class StoreWatch:
             self._not_marked = str(error)
 
     def _compare_mark(self) -> None:
-        noted, newest = _read_mark(self._mark_file), newest_message(self._store)
-        if _loss(noted, newest):
+        noted, newest = read_mark(self._mark_file), newest_message(self._store)
+        if loss(noted, newest):
             self._lost(noted, newest)
 
     def _lost(self, had: int, has: int) -> None:
         """Ask all edges for the windows that they still keep: the store lacks messages that it once had."""
         log.error("the store has lost messages", extra={"had": had, "has": has})
-        self.lost = _loss(had, has)
+        self.lost = loss(had, has)
         self._asked.clear()
         self._ask_for_windows()
 
@@ -310,50 +356,22 @@ class StoreWatch:
     def _check_some(self, after: int) -> int:
         """Check the next bodies, and the pages where a round ends; returns the id of the last one, 0 after a round."""
         self._found(check_files(self._store))
-        result, last = check_bodies(self._store, after, _BODIES)
+        result, last = check_bodies(self._store, after, _BODIES, self._store.aside)
         self._found(result)
         if not result.complete:
             return last
         self._found(check_pages(self._store, _PAGES_S))
-        self.rounds += 1
+        self.rounds, self._again = self.rounds + 1, 0
         return 0
 
+    def _was_read(self, error: StoreDamaged) -> None:
+        """Note damage that a reader or a writer met."""
+        self._read_wrong = self._read_wrong or isinstance(error.__cause__, WrongValue)
+        self._found(IntegrityReport((str(error),), False))
+
     def _found(self, result: IntegrityReport) -> None:
-        if result.faults and not self.fault:
+        known = result.rows and {row.servo for row in result.rows} <= self._store.aside.keys()
+        if result.faults and not self.fault and not known:
             self.fault, self._store.damaged = result.faults[0], True
             self._why, self._read_error = "; ".join(result.faults), ""
             log.error("store damaged: it is not written any more", extra={"why": self._why})
-
-
-def lost_messages(store: Store, beside: Path) -> str:
-    """Messages that a store had when a twin noted the newest one, and has no more; empty: none."""
-    return _loss(_read_mark(_mark_file(store, beside)), newest_message(store))
-
-
-def lost_since(url: str, newest: int) -> str:
-    """Messages that an SQLite store had once, where its newest one now is `newest`; empty: none."""
-    file = sqlite_file(parse_address(url))
-    return "" if file is None else _loss(_read_mark(_beside(file)), newest)
-
-
-def _loss(had: int, has: int) -> str:
-    return f"its newest message is number {has}, and it once had number {had}" if has < had else ""
-
-
-def _mark_file(store: Store, beside: Path) -> Path | None:
-    """File with the number of the newest message; None: the store is in memory."""
-    shared = store.engines.writer.dialect.name == POSTGRESQL
-    file = beside if shared else sqlite_file(store.engines.writer.url)
-    return None if file is None else _beside(file)
-
-
-def _beside(file: Path) -> Path:
-    return file.with_name(f"{file.name}-{_MARK}")
-
-
-def _read_mark(file: Path | None) -> int:
-    """Id in the file; 0: there is none, or it cannot be read."""
-    try:
-        return 0 if file is None else int(file.read_text())
-    except (OSError, ValueError):
-        return 0

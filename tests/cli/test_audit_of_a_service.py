@@ -67,3 +67,13 @@ def test_a_service_whose_store_is_damaged_says_so_after_what_it_still_gives(
             servos(Source(Path("twin.toml"), url, None, None), True)
         assert str(refused.value).startswith(f"{url}: the twin's store is damaged (page 3 is noise)")
     assert capsys.readouterr().out == "[]\n"
+
+
+def test_a_service_that_works_without_a_servo_names_it_after_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    health = b'{"ok": true, "damage": "", "set_aside": {"ax-1": "column twins.gap holds a text"}}'
+    with answering(200, health, b"[]") as url:
+        with pytest.raises(InvalidInput) as refused:
+            servos(Source(Path("twin.toml"), url, None, None), True)
+        why = "the twin's record of ax-1 is damaged (column twins.gap holds a text)"
+        assert str(refused.value).startswith(f"{url}: {why}")
+    assert capsys.readouterr().out == "[]\n"

@@ -45,7 +45,7 @@ def test_a_claim_with_a_number_that_has_no_next_ones_is_refused_and_stops_nobody
             mine, other = window(), window(servo="ax-2")
             refused = await client.put(place(mine), content=encode(mine), headers=headers)
             assert (refused.status_code, refused.json()["code"]) == (400, "not_understood")
-            assert system.executor.damage == ""
+            assert system.executor.damage is None
             stored = await client.put(place(other), content=encode(other), headers=bearer(OTHER))
             assert stored.status_code == 201
 

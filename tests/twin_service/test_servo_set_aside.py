@@ -1,0 +1,166 @@
+"""A twin goes on without a servo of which rows are damaged, says so, and takes it back once they are right."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+import sqlalchemy as sa
+from service_system import OPERATOR, OTHER, bearer, place, twin_file, window
+from store_cases import SYSTEMS, postgresql_addresses
+from watched_store import send, serve, until
+
+from servotwin.messages import encode
+from servotwin.store.engine import StoreDamaged
+from servotwin.store.schema import twins
+from servotwin.twin_service import store_watch
+
+pytest_plugins = ("store_fixtures",)
+
+BAD = "column twins.serial holds -7 where a count up to 2**53 belongs, in the row of servo 'ax-1'"
+REFUSED = (
+    "the twin's record of servo 'ax-1' is damaged and set aside: its edge keeps its windows until that is put right"
+)
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service looks often."""
+    for name in ("_TELL_S", "_RECHECK_S"):
+        monkeypatch.setattr(store_watch, name, 0.01)
+
+
+@pytest.fixture(params=SYSTEMS)
+def path(request: pytest.FixtureRequest, tmp_path):
+    """A twin's file, with its store in each system."""
+    if request.param == "sqlite":
+        return twin_file(tmp_path)
+    address = postgresql_addresses(request.getfixturevalue("postgres_server"))()
+    return twin_file(tmp_path, f'store = "{address}"')
+
+
+def change(system, statement: str) -> None:
+    with system.store.engines.writer.begin() as connection:
+        connection.exec_driver_sql(statement)
+
+
+async def of_other(client, sequence: int) -> int:
+    one = window(sequence, "ax-2")
+    return (await client.put(place(one), content=encode(one), headers=bearer(OTHER))).status_code
+
+
+Look = Callable[..., Awaitable[None]]
+
+
+def with_two(path, look: Look) -> None:
+    async def body(system, client):
+        assert await send(client, 0, 1) == [201, 201]
+        assert await of_other(client, 0) == 201
+        await look(system, client)
+
+    serve(path, body)
+
+
+@pytest.mark.slow
+def test_a_wrong_value_of_one_servo_stops_that_servo_until_it_is_right_again(path, caplog):
+    said = []
+
+    async def look(system, client):
+        telling = asyncio.create_task(system.watch.tell(lambda *about: said.append(about)))
+        change(system, "UPDATE twins SET serial = -7 WHERE servo = 'ax-1'")
+        assert (await client.get("/v1/servos", headers=bearer(OPERATOR))).status_code == 503
+        await until(lambda: system.watch.aside)
+        await until(lambda: not system.watch.fault)
+        assert await of_other(client, 1) == 201
+        one = window(2)
+        refused = await client.put(place(one), content=encode(one), headers=bearer())
+        assert (refused.status_code, refused.json()["code"], refused.json()["detail"]) == (503, "unavailable", REFUSED)
+        polled = await client.get("/v1/servos/ax-1/outgoing", params={"after": 1}, headers=bearer())
+        assert (polled.status_code, polled.json()["detail"]) == (503, REFUSED)
+        health = await client.get("/healthz")
+        assert (health.json()["damage"], health.json()["store"]) == ("", True)
+        assert health.json()["set_aside"] == {"ax-1": BAD}
+        assert any("'ax-1' is set aside" in sentence and BAD in sentence for sentence in health.json()["degraded"])
+        assert "servotwin_servos_set_aside 1\n" in (await client.get("/metrics")).text
+        for address in ("/v1/servos", "/v1/fleet"):
+            listed = (await client.get(address, headers=bearer(OPERATOR))).json()
+            rows = listed["rows"] if isinstance(listed, dict) else listed
+            assert [row["servo"] for row in rows] == ["ax-2"], address
+        asked = await client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR))
+        assert (asked.status_code, asked.json()["detail"]) == (503, REFUSED)
+        system.watch._check_some(0)  # finds the same again
+        assert await of_other(client, 2) == 201
+        await until(lambda: said)
+        change(system, "UPDATE twins SET serial = 0 WHERE servo = 'ax-1'")
+        await until(lambda: not system.watch.aside)
+        assert await send(client, 2) == [201]
+        assert (await client.get("/healthz")).json()["set_aside"] == {}
+        telling.cancel()
+
+    with_two(path, look)
+    assert ("servo set aside", f"the servo {store_watch._ASIDE}: {BAD}", "ax-1") in said
+    assert [line for line in caplog.messages if line.startswith("servo s")] == ["servo set aside", "servo sound again"]
+
+
+@pytest.mark.slow
+def test_a_body_that_changed_stops_its_servo_also_after_a_restart(path):
+    changed = "decode('00', 'hex')" if "postgresql" in path.read_text() else "x'00'"
+
+    async def look(system, client):
+        change(system, f"UPDATE bodies SET body = {changed} WHERE message = 2")
+        system.watch._check_some(0)
+        assert await of_other(client, 1) == 503  # until all of the store is checked
+        await until(lambda: system.watch.aside and not system.watch.fault)
+        assert await of_other(client, 1) == 201
+        assert await send(client, 2) == [503]
+
+    async def again(system, client):
+        system.watch._check_some(0)
+        await until(lambda: system.watch.aside and not system.watch.fault)
+        assert system.watch.aside == {"ax-1": "message 2 of servo 'ax-1': its body differs from its digest"}
+        change(system, "DELETE FROM bodies WHERE message = 2")
+        await until(lambda: not system.watch.aside)
+        assert await send(client, 2) == [201]
+
+    with_two(path, look)
+    serve(path, again)
+
+
+@pytest.mark.slow
+def test_wrong_values_of_half_the_servos_and_more_stop_all(path):
+    async def look(system, client):
+        change(system, "UPDATE twins SET serial = -7")
+        system.watch._check_some(0)
+        await asyncio.sleep(0.5)
+        assert system.watch.fault
+        assert not system.watch.aside
+        assert await of_other(client, 1) == 503
+        change(system, "UPDATE twins SET serial = 0 WHERE servo = 'ax-2'")
+        await until(lambda: not system.watch.fault)
+        assert await of_other(client, 1) == 201
+
+    with_two(path, look)
+
+
+@pytest.mark.slow
+def test_rows_that_are_read_although_they_are_set_aside_stop_all(path):
+    """As of a query that would not leave them out; once may be a reader that began before."""
+
+    async def look(system, client):
+        change(system, "UPDATE twins SET serial = -7 WHERE servo = 'ax-1'")
+        system.watch._check_some(0)
+        await until(lambda: system.watch.aside and not system.watch.fault)
+        for times in range(2):
+            with pytest.raises(StoreDamaged, match="is damaged"):
+                await system.executor.run(lambda: system.store.reading(read_serials))
+            await until(lambda: system.watch.fault)
+            await asyncio.sleep(0.5)
+            assert bool(system.watch.fault) == bool(times)
+        change(system, "UPDATE twins SET serial = 0")
+        await until(lambda: not system.watch.fault and not system.watch.aside)
+        assert await of_other(client, 1) == 201
+
+    with_two(path, look)
+
+
+def read_serials(connection):
+    return connection.scalars(sa.select(twins.c.serial)).all()
