@@ -233,7 +233,7 @@ def _remarks(found: CommissionedAxis) -> list[str]:
             f"force by {100 * simulated.force_error:.2g} %"
         )
     lines += _shaft_lines(found)
-    lines += [each for each in (drive.late, drive.elastic, drive.slip, drive.tight) if each]
+    lines += [each for each in (drive.late, drive.elastic, drive.slip, drive.tight, drive.beside) if each]
     lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
     if found.axis is None:
         lines.append(

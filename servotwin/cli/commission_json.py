@@ -129,5 +129,6 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
         "elastic": drive.elastic or None,
         "slip": drive.slip or None,
         "tight_spot": drive.tight or None,
+        "unmodelled": drive.beside or None,
         "next_experiment": str(drive.advice),
     }

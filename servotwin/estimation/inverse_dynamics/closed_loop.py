@@ -15,7 +15,13 @@ from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.linear_law import MOTOR
 from servotwin.estimation.inverse_dynamics.command_delay import DELAY, derivative
-from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, low_passed, motion_of
+from servotwin.estimation.inverse_dynamics.conditioning import (
+    DriveMotion,
+    RegressionBand,
+    busiest,
+    low_passed,
+    motion_of,
+)
 from servotwin.estimation.inverse_dynamics.fit import (
     ASYMMETRIC,
     SYMMETRIC,
@@ -28,6 +34,7 @@ from servotwin.estimation.inverse_dynamics.fit import (
 from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+from servotwin.estimation.inverse_dynamics.unmodelled import Unmodelled, effects_of, unmodelled
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -63,13 +70,17 @@ class SimulatedLog:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Fits to the simulated motion, if they converged, and the lag of the drive's force behind its command, s."""
+    """Fits to the simulated motion, if they converged, and the lag of the drive's force behind its command, s.
+
+    Their intervals contain what `effects` beside the parameters do.
+    """
 
     symmetric: ParameterFit
     asymmetric: ParameterFit
     simulated: SimulatedLog
     converged: bool
     lag: float = 0.0
+    effects: Unmodelled | None = None
 
 
 def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: float, lag: float = 0.0) -> Axis:
@@ -146,26 +157,26 @@ def refine(
 
     A lag (s) is fitted beside them, from its first value; 0: the drive follows its command at once.
     """
-    fit, found = first, None
-    late = lag > 0.0
+    fit, late = first, lag > 0.0
     for _ in range(_LATE_ROUNDS if late else _ROUNDS):
         simulated = simulated_log(rigid_axis(fit, law, recording, p, lag), fit["offset"], recording, band)
         if not simulated.position_error < _TRACKS:
             return None
         motion = motion_of(simulated.position, recording.rate, band)
-        rows = _rows(recording, motion, band, cycle, fit, simulated)
+        compared = _compared(recording, motion, fit, simulated)
+        rows = rows_of(compared, motion, band, cycle, derivative(recording, simulated.force))
         both = fit_models(rows, DELAY if late else ())
         symmetric, asymmetric = both[0].only(SYMMETRIC), both[1].only(ASYMMETRIC)
         converged = _rests(fit, symmetric, rows)
         slower = both[0]["delay"] if late else 0.0
         converged = converged and abs(slower) <= _RESTS / recording.rate
-        found, fit = Refinement(symmetric, asymmetric, simulated, converged, lag), symmetric
+        found, modelled, fit = Refinement(symmetric, asymmetric, simulated, converged, lag), fit, symmetric
         if not symmetric["inertia"] > 0.0:  # it runs away, towards an axis that cannot be
             return None
         if converged:
             break
         lag = max(lag + slower, _LEAST_LAG / recording.rate) if late else 0.0
-    return found
+    return _with_unmodelled(found, _effects(compared, motion, band, cycle, modelled, late))
 
 
 def _rests(before: ParameterFit, now: ParameterFit, rows: Rows) -> bool:
@@ -176,21 +187,32 @@ def _rests(before: ParameterFit, now: ParameterFit, rows: Rows) -> bool:
     return bool(np.all(changes < _CONVERGED * forces))
 
 
-def _rows(
-    recording: DriveRecording,
-    motion: DriveMotion,
-    band: RegressionBand,
-    cycle: float,
-    fit: ParameterFit,
-    simulated: SimulatedLog,
-) -> Rows:
-    """Rows whose force is that of the model, and by how much the log's differs from the simulated one.
+def _effects(
+    compared: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float, fit: ParameterFit, late: bool
+) -> Unmodelled | None:
+    """What effects beside the parameters explain of a force that is compared with the simulated one."""
+    part, moved = busiest(compared, motion)
+    effects = effects_of(moved, band, part.position, fit)
+    shared = derivative(part, part.force) if late else np.empty((part.force.size, 0))
+    return unmodelled(rows_of(part, moved, band, cycle, np.column_stack([shared, effects.columns])), effects)
+
+
+def _with_unmodelled(found: Refinement, effects: Unmodelled | None) -> Refinement:
+    if effects is None:
+        return found
+    symmetric, asymmetric = effects.widened((found.symmetric, found.asymmetric))
+    return replace(found, symmetric=symmetric, asymmetric=asymmetric, effects=effects)
+
+
+def _compared(
+    recording: DriveRecording, motion: DriveMotion, fit: ParameterFit, simulated: SimulatedLog
+) -> DriveRecording:
+    """The recording with the force of the model, and by how much the log's differs from the simulated one.
 
     What derivatives and the hold of a sampled command do to the simulation they do to the log, and cancel.
     """
     modelled = regressors(motion)[:, : len(SYMMETRIC)] @ fit.values
-    force = modelled + recording.force - simulated.force
-    return rows_of(replace(recording, force=force), motion, band, cycle, derivative(recording, simulated.force))
+    return replace(recording, force=modelled + recording.force - simulated.force)
 
 
 def _relative(measured: Array, simulated: Array) -> float:

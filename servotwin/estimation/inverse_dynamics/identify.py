@@ -12,8 +12,15 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
-from servotwin.estimation.inverse_dynamics.command_delay import NEAR, CommandDelay, delay_remark, fitted_delay
-from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
+from servotwin.estimation.inverse_dynamics.command_delay import (
+    NEAR,
+    CommandDelay,
+    delay_remark,
+    derivative,
+    fitted_delay,
+    later,
+)
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, band_of, busiest, motion_of
 from servotwin.estimation.inverse_dynamics.fit import (
     ASYMMETRIC,
     SYMMETRIC,
@@ -32,6 +39,7 @@ from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 from servotwin.estimation.inverse_dynamics.slip import BeltSlip, belt_slip
 from servotwin.estimation.inverse_dynamics.tight_spot import tight_spot
+from servotwin.estimation.inverse_dynamics.unmodelled import Unmodelled, effects_of, unmodelled
 
 GivenLaw = GivenGains | GivenPid
 # Of the ways of reference and position: a loop that follows is within.
@@ -76,6 +84,8 @@ class IdentifiedDrive:
         Slip of the load against the motor; empty: no load encoder, or none for sure.
     tight : str
         Part of the travel with more friction, in the first recording; empty: none for sure.
+    beside : str
+        What the simulated loop leaves of the command, where it is much and an effect beside the parameters explains it.
     """
 
     symmetric: ParameterFit
@@ -91,6 +101,7 @@ class IdentifiedDrive:
     elastic: str = ""
     slip: str = ""
     tight: str = ""
+    beside: str = ""
 
 
 def identify_drive(
@@ -145,6 +156,7 @@ def identify_drive(
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
     hidden = hidden_shaft(used, motions, bands, late)
     found = found.with_shaft(hidden, late)
+    found = found.with_unmodelled(_effects(used, motions, bands, late))
     slip = belt_slip(used, motions, bands)
     found = found.with_slip(slip)
     spot = None if slip is not None else tight_spot(used[0], motions[0], bands[0])
@@ -165,7 +177,24 @@ def identify_drive(
         "" if hidden is None or slip is not None or split is not None else hidden.remark(used[0].load is not None),
         "" if slip is None else slip.remark(used[0].unit),
         "" if spot is None else spot.remark(used[0].unit),
+        "" if slip is not None else found.beside,
     )
+
+
+def _effects(
+    recordings: Sequence[DriveRecording],
+    motions: Sequence[DriveMotion],
+    bands: Sequence[RegressionBand],
+    late: CommandDelay,
+) -> Unmodelled | None:
+    """What effects beside the parameters and a delay explain of the command."""
+    every = []
+    for recording, motion, band in zip(recordings, motions, bands, strict=True):
+        part, moved = busiest(later(recording, late.delay), motion)
+        effects = effects_of(moved, band, part.position, late.symmetric)
+        extra = np.column_stack([derivative(part, part.force), effects.columns])
+        every.append(rows_of(part, moved, band, cycle_time(motion), extra))
+    return unmodelled(joined(every), effects)
 
 
 def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
@@ -211,6 +240,22 @@ class _Fits:
             symmetric = replace(symmetric, values=self.symmetric.values + symmetric.values - late.symmetric.values)
             asymmetric = replace(asymmetric, values=self.asymmetric.values + asymmetric.values - late.asymmetric.values)
         return _Fits(widened(self.symmetric, symmetric), widened(self.asymmetric, asymmetric), refined, self.doubts)
+
+    def with_unmodelled(self, effects: Unmodelled | None) -> _Fits:
+        """These, their intervals with what effects beside the parameters do, in a loop that comes to no rest too."""
+        fits, refined = (self.symmetric, self.asymmetric), self.refinement
+        unrest = None if refined is None or refined.converged else refined.effects
+        for each in (effects, unrest):
+            fits = fits if each is None else each.widened(fits)
+        return replace(self, symmetric=fits[0], asymmetric=fits[1])
+
+    @property
+    def beside(self) -> str:
+        """Sentence on effects beside the parameters; empty: none that matters."""
+        refined = self.refinement
+        if refined is None or not refined.converged or refined.effects is None:
+            return ""
+        return refined.effects.remark(refined.symmetric)
 
     def with_slip(self, slip: BeltSlip | None) -> _Fits:
         """These, their intervals with what slip between motor and load does."""
