@@ -298,8 +298,9 @@ class Store:
         """JSON texts of contexts by key; unknown keys are left out."""
         return self._read(lambda connection: queries.contexts(connection, keys))
 
-    def reading(self, action: Callable[[sa.Connection], _Result]) -> _Result:
-        """Run a query, such as those of `overview`, in a transaction that reads; raises StoreUnavailable."""
+    def reading(self, action: Callable[[sa.Connection], _Result], *servos: str) -> _Result:
+        """Run a query, such as those of `overview`, of all servos or these alone; raises StoreUnavailable."""
+        self.require_sound(*servos)
         return self._read(action)
 
     def write_nothing(self) -> None:

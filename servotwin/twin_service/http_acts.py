@@ -94,7 +94,7 @@ class ActsApi:
 
     async def _get(self, request: HttpRequest) -> HttpResponse:
         servo, name = admitted_servo(self._operators, request), self._operators.check(request)
-        read = partial(self._store.reading, lambda connection: machine_oversight(connection, servo))
+        read = partial(self._store.reading, lambda connection: machine_oversight(connection, servo), servo)
         found: dict[str, Any] = await store_query(self._readers, read)
         return json_response({**found, "may_act": self._operators.may_act(name)}, headers=_FRESH)
 

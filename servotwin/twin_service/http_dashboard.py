@@ -267,7 +267,7 @@ class DashboardApi:
         return servo, limit_of(request), request.integer("before", 0) or None
 
     def _gaps(self, servo: str, limit: int, before: int | None) -> dict[str, Any]:
-        return self._store.reading(lambda connection: machine_series(connection, servo, limit, before))
+        return self._store.reading(lambda connection: machine_series(connection, servo, limit, before), servo)
 
     async def _get_report(self, request: HttpRequest) -> HttpResponse:
         servo = admitted_servo(self._operators, request)
@@ -292,8 +292,8 @@ class DashboardApi:
         return _csv(text, f"{servo}-{boot}-{sequence}.csv")
 
     async def _machine(self, request: HttpRequest) -> MachineFacts:
-        read = partial(machine_of, servo=request.path["servo"])
-        return await store_query(self._executor, partial(self._store.reading, read))
+        read = partial(machine_of, servo=(servo := request.path["servo"]))
+        return await store_query(self._executor, partial(self._store.reading, read, servo))
 
 
 def _channels(

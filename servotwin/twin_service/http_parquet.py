@@ -61,13 +61,15 @@ class ParquetApi:
         servo = admitted_servo(self._operators, request)
         before = request.integer("before", 0) or None
         read = partial(machine_series, servo=servo, limit=limit_of(request), before=before)
-        found = await store_query(self._executor, partial(self._store.reading, read))
+        found = await store_query(self._executor, partial(self._store.reading, read, servo))
         return await self._file(servo, found["windows"], f"{servo}-gaps.parquet")
 
     async def _get_channels(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)
         servo, boot, sequence = (request.path[key] for key in ("servo", "boot", "sequence"))
-        machine = await store_query(self._executor, partial(self._store.reading, partial(machine_of, servo=servo)))
+        machine = await store_query(
+            self._executor, partial(self._store.reading, partial(machine_of, servo=servo), servo)
+        )
         columns = await self._executor.run(lambda: window_columns(decoded_window(stored), machine))
         return await self._file(servo, columns, f"{servo}-{boot}-{sequence}.parquet")
 

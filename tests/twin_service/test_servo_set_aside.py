@@ -85,8 +85,9 @@ def test_a_wrong_value_of_one_servo_stops_that_servo_until_it_is_right_again(pat
             listed = (await client.get(address, headers=bearer(OPERATOR))).json()
             rows = listed["rows"] if isinstance(listed, dict) else listed
             assert [row["servo"] for row in rows] == ["ax-2"], address
-        asked = await client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR))
-        assert (asked.status_code, asked.json()["detail"]) == (503, REFUSED)
+        for of_servo in ("", "/audit", "/events", "/gaps", "/acts", "/report.html", "/windows/b/0"):
+            asked = await client.get(f"/v1/servos/ax-1{of_servo}", headers=bearer(OPERATOR))
+            assert (asked.status_code, asked.json()["detail"]) == (503, REFUSED), of_servo
         system.watch._check_some(0)  # finds the same again
         assert await of_other(client, 2) == 201
         await until(lambda: said)
