@@ -140,7 +140,9 @@ class TwinPoller:
 
     def _newest(self, connection: HTTPConnection, servo: str, limit: int) -> ServoEstimate | None:
         """Newest estimate among the last windows of a servo, at most `limit`."""
-        return newest_estimate(msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}")))
+        traces = msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}"))
+        # A refusal is an object: the servo is set aside, or the store cannot be read now.
+        return newest_estimate(traces) if isinstance(traces, list) else None
 
     def _get(self, connection: HTTPConnection, path: str) -> bytes:
         connection.request("GET", path, headers=self._headers)

@@ -364,16 +364,19 @@ def test_a_machine_that_does_not_keep_its_speed_is_said(speed: float, reached: f
     assert ("does not reach" in line) == bool(said)
 
 
-@pytest.mark.parametrize(("waiting", "limit"), [(0, 20), (50, 70), (5000, 1000)])
+@pytest.mark.parametrize(
+    ("waiting", "limit", "answer"),
+    [(0, 20, b"[]"), (50, 70, b"[]"), (5000, 1000, b"[]"), (50, 70, b'{"error": "set aside"}')],
+)
 def test_the_newest_estimate_is_looked_for_behind_the_windows_that_wait(
-    monkeypatch: pytest.MonkeyPatch, waiting: int, limit: int
+    monkeypatch: pytest.MonkeyPatch, waiting: int, limit: int, answer: bytes
 ) -> None:
     health = b'{"waiting": {"messages": %d, "age": 0.0}}' % waiting
     asked = []
 
     def get(_self: TwinPoller, _connection: object, path: str) -> bytes:
         asked.append(path)
-        return {"/healthz": health, "/metrics": b""}.get(path, b"[]")
+        return {"/healthz": health, "/metrics": b""}.get(path, answer)
 
     monkeypatch.setattr(TwinPoller, "_get", get)
     poller = TwinPoller("http://127.0.0.1:1", "token", ["a"])
