@@ -46,7 +46,7 @@ class NextExperiment:
 
     def __str__(self) -> str:
         """One sentence."""
-        known = f"{_WORDS[self.worst]} is known worst, to ± {100.0 * self.half_width:.2g} % (95 %)"
+        known = f"by chance alone {_WORDS[self.worst]} is known worst, to ± {100.0 * self.half_width:.2g} % (95 %)"
         if self.duration == 0.0:
             return f"{known}: no further experiment is needed for ± {100.0 * _WANTED:g} %"
         seconds = float(f"{self.duration:.2g}")
