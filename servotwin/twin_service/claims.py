@@ -15,9 +15,9 @@ from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.limits import MAX_SERVOS, RequestRejected, unavailable
+from servotwin.twin_service.limits import MAX_SERVOS, RequestRejected
 from servotwin.twin_service.monitoring import Metrics
-from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_executor import StoreExecutor, unavailable
 
 log = logging.getLogger(__name__)
 

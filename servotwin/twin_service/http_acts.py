@@ -21,10 +21,10 @@ from servotwin.twin_service.http_edge import SERVO_PATH
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.http_operator import admitted_servo, store_query
 from servotwin.twin_service.http_server import BodyReader
-from servotwin.twin_service.limits import RateLimiter, RequestRejected, unavailable
+from servotwin.twin_service.limits import RateLimiter, RequestRejected
 from servotwin.twin_service.openapi import JSON, QUERY_ERRORS, SERVO, operation
 from servotwin.twin_service.sessions import OperatorAccess
-from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_executor import StoreExecutor, unavailable
 
 _BODY_S = 10.0
 _RATE, _BURST = 1.0, 20.0

@@ -19,7 +19,7 @@ from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response, msgpack_response
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement
-from servotwin.twin_service.limits import RequestRejected, unavailable
+from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.openapi import (
     BOOT,
     CLAIM,
@@ -35,6 +35,7 @@ from servotwin.twin_service.openapi import (
     operation,
     parameter,
 )
+from servotwin.twin_service.store_executor import unavailable
 
 Read = Callable[[str, int], Awaitable[Sequence[OutgoingMessage]]]
 """(servo, serial) -> messages with higher serials, rising."""

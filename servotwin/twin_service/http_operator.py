@@ -20,7 +20,7 @@ from servotwin.store.store import Store
 from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
 from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
-from servotwin.twin_service.limits import RequestRejected, unavailable
+from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.openapi import (
     BOOT,
@@ -36,7 +36,7 @@ from servotwin.twin_service.openapi import (
     parameter,
 )
 from servotwin.twin_service.sessions import OperatorAccess
-from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_executor import StoreExecutor, unavailable
 
 MAX_ROWS = 1000
 _Result = TypeVar("_Result")

@@ -25,8 +25,9 @@ from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.twin_service.backlog_pace import BacklogPace
-from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter, unavailable
+from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.store_executor import unavailable
 
 LETTERS = (Hello, Receipt, Fallback, Answer)
 

@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from typing import Any, NamedTuple
 
 from servotwin.messages import Refusal
-from servotwin.store.engine import ServoSetAside
 
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 """ASGI's: the next event of a request."""
@@ -57,11 +56,6 @@ class RequestRejected(Exception):
         super().__init__(detail)
         self.refusal, self.detail, self.close, self.mark = refusal, detail, close, ""
         self.status = STATUS[refusal] if status is None else status
-
-
-def unavailable(error: Exception, detail: str) -> RequestRejected:
-    """Rejection for want of the store, in the words of `detail`, or in its own where a servo is set aside."""
-    return RequestRejected(Refusal.UNAVAILABLE, str(error) if isinstance(error, ServoSetAside) else detail)
 
 
 class Disconnected(Exception):

@@ -8,7 +8,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+from servotwin.messages import Refusal
 from servotwin.store.engine import ServoSetAside, StoreDamaged, StoreUnavailable
+from servotwin.twin_service.limits import RequestRejected
 
 _Result = TypeVar("_Result")
 _THREADS = 4
@@ -64,3 +66,8 @@ class StoreExecutor:
     def close(self) -> None:
         """Wait for the running calls."""
         self._threads.shutdown()
+
+
+def unavailable(error: Exception, detail: str) -> RequestRejected:
+    """Rejection for want of the store, in the words of `detail`, or in its own where a servo is set aside."""
+    return RequestRejected(Refusal.UNAVAILABLE, str(error) if isinstance(error, ServoSetAside) else detail)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import signal
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.output_error.fit import Search
@@ -49,6 +48,8 @@ def stretch_share(problem: Problem) -> tuple[float, float]:
         The share, and its standard deviation. What goes with place, speed and its sign is ratio, damping, delay and
         friction, and does not count.
     """
+    from scipy import signal  # most of a second to import, and few windows come here
+
     rate, omega = 1.0 / problem.interval, problem.model.speed
     corner = min(_BAND * omega / (2.0 * math.pi), _HIGHEST * rate)
     sections = signal.butter(_ORDER, corner, fs=rate, output="sos")
