@@ -24,7 +24,7 @@ KERNELS := import servotwin as st; servo = st.Servo.preset("paper"); \
 help:
 	@echo "make demo       a worn servo loses stability; its digital twin wins it back"
 	@echo "make reproduce  every figure and claim of the paper beside what is measured"
-	@echo "make check      format, lint, types, layers and the fast tests, a good minute"
+	@echo "make check      format, lint, types, layers and the fast tests, two minutes (in a fresh clone five)"
 	@echo "make test       the same and all tests, 6 to 30 minutes on two idle cores; as root it installs the Debian packages"
 	@echo "                that some tests need (make test PACKAGES=no: skip those tests instead)"
 	@echo "make fuzz       the random tests with fresh and with more examples, and the explorations, which make test leaves out"

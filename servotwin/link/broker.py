@@ -202,6 +202,11 @@ class Connection:
         stopping.join(_LINGER_S if connection is None else None)
         timer.cancel()
         timer.join()
+        if not stopping.is_alive():
+            # It closes its own sockets when nothing refers to it: not only when a garbage collector finds the circle.
+            client = self._client
+            client.on_connect = client.on_disconnect = client.on_subscribe = client.on_message = None
+            client.on_publish = client.on_connect_fail = None
 
     def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, answer: Any) -> None:
         self._answered = True

@@ -1,12 +1,15 @@
 """A broker that takes no packet as large as a window: the edge says so, keeps the window, and sends what is smaller."""
 
+import gc
+import threading
+import weakref
 from pathlib import Path
 
 import pytest
 from mosquitto import Mosquitto, broker
 from mqttparts import edge, kept, parcel, twin
 
-from servotwin.link.broker import Broker
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.transport import Parcel, Unreachable
 from servotwin.messages import Hello, Setting, encode
@@ -74,3 +77,18 @@ def test_a_message_that_is_too_large_for_the_limit_of_a_broker_that_came_back_ho
         settings.write_text(settings.read_text() + "max_packet_size 20000\n")
         server.start()
         assert [delivered_or_why(here, HELLO) for _ in range(5)][-1] == ""
+
+
+def test_a_closed_connection_leaves_no_socket_to_the_garbage_collector(server: Mosquitto) -> None:
+    up = threading.Event()
+    events = MqttCallbacks(lambda *_: None, lambda _fresh: up.set(), lambda _why: None)
+    gc.disable()
+    try:
+        connection = Connection(Broker(server.url), MqttSession("a", ("b",), 10), events)
+        client = weakref.ref(connection._client)
+        assert up.wait(10.0)
+        connection.close()
+        del connection
+        assert client() is None
+    finally:
+        gc.enable()
