@@ -65,6 +65,7 @@ class Noise:
 
     def source(self, rate: float, rng: np.random.Generator) -> NoiseSource:
         """A source of consecutive blocks, stationary from its first sample."""
+        # Of noise of any size: the filter's state does not depend on it.
         root = _start_root(Noise(1.0, (self.band[0], self.band[1]), self.kind), rate)
         start = root @ rng.standard_normal(len(root))
         return NoiseSource(self.std, self.filter(rate), start.reshape(-1, 2), rng)

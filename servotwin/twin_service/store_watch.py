@@ -109,7 +109,7 @@ class StoreWatch:
 
     @property
     def aside(self) -> dict[str, str]:
-        """What is wrong with the rows of the servos that are set aside, by servo."""
+        """Servos that are set aside, each with a clause on its first wrong row."""
         return {servo: wrong.clause for servo, wrong in self._store.aside.items()}
 
     def sentences(self) -> list[str]:

@@ -190,7 +190,7 @@ def _rests(before: ParameterFit, now: ParameterFit, rows: Rows) -> bool:
 def _effects(
     compared: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float, fit: ParameterFit, late: bool
 ) -> Unmodelled | None:
-    """What effects beside the parameters explain of a force that is compared with the simulated one."""
+    """Effects beside the parameters, by a force that is compared with the simulated one."""
     part, moved = busiest(compared, motion)
     effects = effects_of(moved, band, part.position, fit)
     shared = derivative(part, part.force) if late else np.empty((part.force.size, 0))
@@ -198,6 +198,7 @@ def _effects(
 
 
 def _with_unmodelled(found: Refinement, effects: Unmodelled | None) -> Refinement:
+    """The refinement, its intervals with what effects beside the parameters do."""
     if effects is None:
         return found
     symmetric, asymmetric = effects.widened((found.symmetric, found.asymmetric))

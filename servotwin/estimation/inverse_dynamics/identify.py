@@ -189,7 +189,7 @@ def _effects(
     bands: Sequence[RegressionBand],
     late: CommandDelay,
 ) -> Unmodelled | None:
-    """What effects beside the parameters and a delay explain of the command."""
+    """Effects beside the parameters and a delay, by the command."""
     every = []
     for recording, motion, band in zip(recordings, motions, bands, strict=True):
         part, moved = busiest(later(recording, late.delay), motion)
