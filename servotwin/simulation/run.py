@@ -100,7 +100,7 @@ class Run:
 
     @property
     def measured_position(self) -> Array:
-        """Output of the position sensor, noise and quantisation included, m."""
+        """Output of the position sensor, noise and quantisation included, m; also between two ticks."""
         return self._column("measured_position")
 
     @property

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.control import law
 from servotwin.control.controller import Controller
@@ -78,7 +79,8 @@ class SampledEngine:
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
         self.law_state, self.parameters = self._started(start.command)
-        self.draws = NoiseBuffer(self._noise_source(), ahead=0 if self.keep is None else _CHUNK)
+        self.draws = NoiseBuffer(self._noise_source(), 0 if self.keep is None else _CHUNK, self.tick_every)
+        self.start_error = self._encoder_error()
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         between = self.readings is not None and self.readings.between_samples
@@ -113,10 +115,10 @@ class SampledEngine:
         )
 
     def _noise_source(self) -> NoiseSource | PositionErrors | None:
-        """Source of what the measured position is off by at each tick."""
+        """Source of what the measured position is off by at each step, of samples or of ticks."""
         if self.readings is not None:
-            return self.readings.source(self.tick_rate, self.tick_every, self.rng)
-        return None if self.noise is None else self.noise.source(self.tick_rate, self.rng)
+            return self.readings.source(self.rate, self.rng)
+        return None if self.noise is None else self.noise.source(self.rate, self.rng)
 
     @property
     def _fed_back(self) -> Encoder:
@@ -161,6 +163,7 @@ class SampledEngine:
         if self.keep is not None and index - self.oldest > 2 * self.keep:
             self.output = shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
             self.record.size[1] = 0
+            self.draws.forget(self.oldest)
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
         """Base steps during or at the end of which the gap's cubic changes, with those changes."""
@@ -296,7 +299,7 @@ class SampledEngine:
             controller.law(planned if tolerance is None else tolerance),
             self.law_state,
             float(self.inputs.reference.value(time)),
-            self._shown(self._noise_ahead()),
+            self._shown(self.draws.next()),
         )
         self.controller, self.parameters = controller, controller.law(None)
 
@@ -317,11 +320,30 @@ class SampledEngine:
         return out
 
     def _measured(self, first: int, last: int) -> Array:
-        ticks = np.arange(first, last) * self.record_every // self.tick_every
+        samples = np.arange(first, last)
+        ticks, since = np.divmod(samples * self.record_every, self.tick_every)
         out = self.output.measured[ticks - self.output.first_tick]
-        if last > self.index and not self.finished:
+        between = since > 0
+        if np.any(between):
+            out[between] = self._between_ticks(samples[between])
+        if last > self.index and not self.finished and not between[-1]:
             out[-1] = self._measured_now()
         return out
+
+    def _between_ticks(self, samples: NDArray[np.int64]) -> Array:
+        """Readings at samples between ticks, where a step is a sample."""
+        late = self._fed_back.late(self.rate)
+        steps = np.maximum(samples - late, 0)
+        errors = np.where(samples < late, self.start_error, self.draws.at(steps))
+        return quantised(
+            self._sensed(steps[0], steps[-1] + 1)[steps - steps[0]] + errors, self.servo.position_resolution
+        )
+
+    def _sensed(self, first: int, last: int) -> Array:
+        """What the position sensor sees at samples first .. last - 1, without errors and delay."""
+        if self.servo.at_motor:
+            return self.servo.p * self.channel("theta_m", first, last)
+        return self.channel("position", first, last)
 
     def _measured_now(self) -> float:
         """Measurement of the present state, without a noise that is still to be drawn."""
@@ -330,12 +352,6 @@ class SampledEngine:
     def _encoder_error(self) -> float:
         """Error of the encoder of the position in the present state."""
         return 0.0 if self.readings is None else float(np.ravel(self.readings.position.at(np.array([self.base])))[0])
-
-    def _noise_ahead(self) -> float:
-        """Noise of the tick that is due, which takes it again."""
-        noise = self.draws.take(1)
-        self.draws.put_back(noise)
-        return float(noise[0])
 
     def _reading(self, noise: float = 0.0) -> float:
         """Reading of the position sensor in the present state."""

@@ -70,8 +70,8 @@ class Simulation:
         Hz, of what is recorded. By default 5000 Hz, or the controller's own rate where the two do not divide one
         another.
     noise : Noise, optional
-        On the measured position, in place of that of its encoder; a continuous controller sees it constant between
-        samples.
+        On the measured position, in place of that of its encoder, drawn for each sample, or each tick of the
+        controller where these are more; a continuous controller sees it constant between samples.
     seed : int
         Seed of the noise.
     input_bias : float
@@ -138,13 +138,13 @@ class Simulation:
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
         servo, law, inputs, samples, readings = self.servo, self.controller, self.inputs, self.samples, self.readings
         # The oldest sample that can be asked for shows an older one.
-        keep = None if self.keep is None else self.keep + (0 if readings is None else readings.motor_late)
+        keep = None if self.keep is None else self.keep + (0 if readings is None else readings.late)
         if noise is not None and isinstance(law, LinearLaw) and not law.reads("y_load"):
             raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
         if law.sample_rate is None:
             source: NoiseSource | PositionErrors | None = None
             if readings is not None:
-                source = readings.source(inputs.sample_rate, 1, rng)
+                source = readings.source(inputs.sample_rate, rng)
             elif noise is not None:
                 source = noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)

@@ -8,6 +8,8 @@ from paper_loop import MOTOR, SCREW, Array
 from servotwin.control import law
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.window import Window
 from servotwin.hybrid.crossing import is_leaving
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
@@ -143,13 +145,32 @@ def test_recording_does_not_touch_the_loop() -> None:
             assert np.abs(a - b).max() <= 1e-12 * np.abs(b).max(), (tick, name)
 
 
-def test_between_ticks_the_voltage_and_the_measurement_are_held() -> None:
+def test_between_ticks_the_voltage_is_held_and_the_sensor_reads_on() -> None:
     run = sampled(1e3, 1.0, 5e3, **COMMON)
-    for channel in (run.voltage, run.measured_position):
-        groups = channel[:-1].reshape(-1, 5)
-        assert np.all(groups == groups[:, :1])
-    assert np.all(run.measured_position[:-1:5] == run.position[:-1:5])
+    groups = run.voltage[:-1].reshape(-1, 5)
+    assert np.all(groups == groups[:, :1])
+    assert np.array_equal(run.measured_position, run.position)
     assert not np.all(np.diff(run.position[:-1].reshape(-1, 5)) == 0.0)
+
+
+@pytest.mark.parametrize("noise", [Noise(std=5e-5), Noise(std=5e-5, kind="white")])
+def test_noise_between_ticks_goes_on(noise: Noise) -> None:
+    run = sampled(1e3, 4.0, 5e3, **COMMON, noise=noise, seed=3)
+    errors = run.measured_position - run.position
+    assert errors == pytest.approx(noise.samples(errors.size, 5e3, np.random.default_rng(3)), abs=1e-15)
+    coarse = sampled(1e3, 4.0, 1e3, **COMMON, noise=noise, seed=3)
+    assert np.std(coarse.measured_position - coarse.position) == pytest.approx(np.std(errors), rel=0.1)
+
+
+@pytest.mark.parametrize("tick", [1e3, 200.0, 100.0])
+def test_the_gap_of_a_slow_controller_is_seen_at_every_sample(tick: float) -> None:
+    """The default rate of the record is a multiple of the controller's."""
+    servo = PAPER.replace(sample_rate=tick)
+    run = simulate(servo, 2.0, reference=SquareWave(1e-3, 3.0), gap=np.radians(8.0))
+    assert run.sample_rate == 5000.0
+    estimate = estimate_gap(Window.from_run(run, 0.0, 1.5), servo)
+    assert estimate.ok
+    assert estimate.gap == pytest.approx(np.radians(8.0), abs=np.radians(1e-3))
 
 
 @pytest.mark.parametrize(("tick", "sample"), [(5000.0, 3000.0), (3000.0, 5000.0), (1000.0, 1000.001)])

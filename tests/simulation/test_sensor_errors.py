@@ -142,6 +142,45 @@ def test_a_noisy_run_is_the_same_in_pieces() -> None:
         assert np.array_equal(few.measured(name, 850, 1001), run.measured(name)[850:])
 
 
+FINE = 5  # samples of the record per tick
+
+
+@pytest.mark.parametrize("feedback", ["load", "motor"])
+@pytest.mark.parametrize("controller", [PID, CASCADE])
+def test_between_two_ticks_an_encoder_reads_what_it_sees_then(controller: str, feedback: str) -> None:
+    if feedback == "motor" and controller == CASCADE:
+        controller += '\non = "motor"'
+    sensors = {"position_noise": 2e-6, "encoder_noise": 1e-3, "position_resolution": 1e-6, "feedback": feedback}
+    axis = drive(controller, **LATE, position_offset=1e-4, encoder_offset=0.1, **sensors)
+    run = st.simulate(axis, 1.0, reference=1e-3, sample_rate=FINE * RATE, seed=5)
+    read, late, offset = run.measured("position"), 3 * FINE, 1e-4
+    if feedback == "motor":
+        assert read == pytest.approx(axis.p * run.measured("theta_m"), abs=1e-15)
+        late, offset = FINE, 0.1 * axis.p
+    sensed = run.position if feedback == "load" else axis.p * run.theta_m
+    errors = (read[late:] - sensed[:-late] - offset)[: 900 * FINE].reshape(-1, FINE)
+    size = np.hypot(2e-6, 1e-6 / np.sqrt(12.0)) if feedback == "load" else 1e-3 * axis.p
+    assert np.std(errors, axis=0) == pytest.approx(np.full(FINE, size), rel=0.1)
+    assert np.abs(np.corrcoef(errors.T) - np.eye(FINE)).max() < 0.15
+
+
+@pytest.mark.parametrize("noise", [None, st.Noise(1e-5, kind="white")])
+def test_readings_between_ticks_are_the_same_in_pieces(noise: st.Noise | None) -> None:
+    axis = drive(CASCADE, **LATE, position_noise=2e-6, position_resolution=1e-6)
+    options: dict[str, Any] = {"reference": 1e-3, "sample_rate": FINE * RATE, "seed": 5, "noise": noise}
+    whole = st.simulate(axis, 1.0, **options).measured("position")
+    pieces, few = Simulation(axis, 1.0, **options), Simulation(axis, 1.0, **options, keep=203)
+    for index in (1, 3, 78, 601, 604, 2999, 3003):
+        pieces.advance(index)
+        few.advance(index)
+        assert np.array_equal(pieces.measured("position", 0, index), whole[:index])
+        first = max(index - 203, 0)
+        assert np.array_equal(few.measured("position", first, index), whole[first:index])
+        # The present sample, unless its tick draws a noise that is still to come.
+        if noise is None or index % FINE:
+            assert few.measured("position", index, index + 1)[0] == whole[index]
+
+
 def test_the_law_gets_what_is_recorded() -> None:
     """The cascade, ticked by hand on the recorded readings, gives the recorded commands."""
     axis = drive(CASCADE, position_noise=2e-6, encoder_noise=1e-3, position_delay=2e-3, encoder_delay=1e-3)
