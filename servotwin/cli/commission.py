@@ -144,12 +144,26 @@ def headline(found: CommissionedAxis) -> str:
 
 def _lines(found: CommissionedAxis, fit: ParameterFit) -> list[str]:
     units = units_of(found)
-    return [f"{WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names]
+    return [*(f"{WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names), *_frictions(found)]
+
+
+def _frictions(found: CommissionedAxis) -> list[str]:
+    """The friction at the mean and the largest speed."""
+    recording = found.logs[0].recording
+    return [
+        f"friction at {each.speed:.3g} {recording.unit}/s ({which}) {_rounded(each.force, each.half_width)} "
+        f"{recording.force_unit}"
+        for each, which in zip(found.drive.friction, ("the mean speed", "the largest"), strict=True)
+    ]
 
 
 def _number(fit: ParameterFit, name: str) -> str:
-    """A parameter with half of its 95 % interval, both to the interval's second digit."""
-    value, half = fit[name], fit.half_width(name)
+    """A parameter with half of its 95 % interval."""
+    return _rounded(fit[name], fit.half_width(name))
+
+
+def _rounded(value: float, half: float) -> str:
+    """A number with half of its interval, both to the interval's second digit."""
     decimals = 1 - math.floor(math.log10(half)) if 0.0 < half < math.inf else _DECIMALS + 1
     if decimals > _DECIMALS:
         return f"{value:.6g} ± {half:.2g}"
@@ -174,6 +188,7 @@ def _print(console: Console, found: CommissionedAxis) -> None:
             highlight=False,
         )
     console.print(_table(found), highlight=False)
+    console.print(f"{', '.join(_frictions(found))} (± 95 %)", highlight=False)
     for line in _remarks(found):
         console.print(line, highlight=False)
 

@@ -28,10 +28,8 @@ WORDS = {
 def units_of(found: CommissionedAxis) -> dict[str, str]:
     recording = found.logs[0].recording
     force, position = recording.force_unit, recording.unit
-    if found.force_per_command is not None:
-        inertia, viscous = ("kg m^2", "N m s/rad") if recording.rotary else ("kg", "N s/m")
-    else:
-        inertia, viscous = f"{force} s^2/{position}", f"{force} s/{position}"
+    viscous = "N m s/rad" if found.force_per_command is not None and recording.rotary else f"{force} s/{position}"
+    inertia = recording.inertia_unit
     return {
         name: inertia if name == "inertia" else viscous if name.startswith("viscous") else force for name in (*WORDS,)
     }
@@ -120,6 +118,10 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
             "force_error": refined.simulated.force_error,
             "converged": refined.converged,
         },
+        "friction": [
+            {"speed": each.speed, "value": each.force, "half_width_95": each.half_width, "unit": units["coulomb"]}
+            for each in drive.friction
+        ],
         "controller": _law_dict(drive.law),
         "shaft": _shaft_dict(found),
         "gap": _gap_dict(found.logs[0]),

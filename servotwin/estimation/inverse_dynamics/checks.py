@@ -52,7 +52,12 @@ def check_motion(recording: DriveRecording) -> None:
     InvalidInput
     """
     reach, unit = float(np.ptp(recording.position)), recording.unit
-    if not reach > _COUNTS * recording.resolution or reach == 0.0:
+    if reach == 0.0:
+        raise InvalidInput(
+            f"{recording.source}: the position is {recording.position[0]:.6g} {unit} throughout: record a motion to "
+            "and fro at several speeds, or is --motor another column?"
+        )
+    if not reach > _COUNTS * recording.resolution:
         raise InvalidInput(
             f"{recording.source}: the position moves by {reach:.3g} {unit} only, {_COUNTS:g} counts of the encoder are "
             f"{_COUNTS * recording.resolution:.3g} {unit}: record a motion to and fro at several speeds"
@@ -171,12 +176,19 @@ def check_sense(recording: DriveRecording, fit: ParameterFit) -> None:
     ------
     InvalidInput
     """
-    if fit["inertia"] < 0.0 and fit.relative_error < _UNEXPLAINED:
+    inertia, half, unit = fit["inertia"], fit.half_width("inertia"), recording.inertia_unit
+    if fit.relative_error <= _UNEXPLAINED and inertia < -half:
         raise InvalidInput(
-            f"{recording.source}: the command acts against the motion (inertia {fit['inertia']:.3g}): its sign is "
+            f"{recording.source}: the command acts against the motion (inertia {inertia:.3g} {unit}): its sign is "
             "wrong, turn it with a negative --scale; or --motor and --command are swapped"
         )
-    if fit["inertia"] <= fit.half_width("inertia") or fit.relative_error > _UNEXPLAINED:
+    if fit.relative_error <= _UNEXPLAINED and inertia <= half:
+        raise InvalidInput(
+            f"{recording.source}: the inertia does not show ({inertia:.3g} ± {half:.2g} {unit}, 95 %), although "
+            f"inertia and friction explain {100.0 * (1.0 - fit.relative_error**2):.0f} % of the command: record longer "
+            "strokes at several speeds, whose accelerations last for many samples; or are --motor and --command mixed up?"
+        )
+    if fit.relative_error > _UNEXPLAINED:
         raise InvalidInput(
             f"{recording.source}: inertia and friction explain {100.0 * (1.0 - fit.relative_error**2):.0f} % of the "
             "command only: is --command what this drive gets, and --motor its position (not the "

@@ -28,6 +28,7 @@ _HIGHEST = 0.4  # of the sample rate: highest corner
 _EDGE = 2.0  # periods of the corner that a filter needs to forget the ends
 _REST = 2.0  # periods of the corner: a longer standstill is no reversal
 _SEGMENTS = 8  # of a spectrum's average
+_LARGEST = 0.99  # quantile that counts as the largest speed
 _KEPT = 0.99  # share of usable samples below a row's filter
 LONGEST = 2**18
 """Samples of a log that are fitted with many regressors at once."""
@@ -76,6 +77,12 @@ class DriveMotion:
     def seconds(self) -> float:
         """Duration of what moves, s."""
         return float(np.sum(~self.resting)) / self.rate
+
+    @property
+    def speeds(self) -> Array:
+        """(2,) mean and largest speed of what moves; the largest is that which a hundredth of it exceeds."""
+        fast = np.abs(self.speed[~self.resting])
+        return np.array([fast.mean(), np.quantile(fast, _LARGEST)])
 
 
 def band_of(recording: DriveRecording) -> RegressionBand:

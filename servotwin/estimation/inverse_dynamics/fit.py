@@ -39,6 +39,8 @@ class ParameterFit:
         or the delay of a late one.
     freedom : (p,) array
         Degrees of freedom of the variances.
+    beside : (p,) array
+        Largest difference that an effect beside the parameters may make to each: standard deviations contain it.
     relative_error : float
         Norm of what the model leaves over that of the force, both filtered.
     condition : float
@@ -50,6 +52,7 @@ class ParameterFit:
     values: Array
     covariance: Array
     freedom: Array
+    beside: Array
     relative_error: float
     condition: float
     rows: int
@@ -62,12 +65,19 @@ class ParameterFit:
         """The fit of some of its parameters, with what the others do to their covariance."""
         at = [self.names.index(name) for name in names]
         covariance = self.covariance[np.ix_(at, at)]
-        return replace(self, names=names, values=self.values[at], covariance=covariance, freedom=self.freedom[at])
+        return replace(
+            self,
+            names=names,
+            values=self.values[at],
+            covariance=covariance,
+            freedom=self.freedom[at],
+            beside=self.beside[at],
+        )
 
     def std(self, name: str) -> float:
         """Standard deviation of a parameter."""
         place = self.names.index(name)
-        return math.sqrt(float(self.covariance[place, place]))
+        return math.hypot(math.sqrt(float(self.covariance[place, place])), float(self.beside[place]))
 
     def half_width(self, name: str) -> float:
         """Half the 95 % interval of a parameter."""
@@ -127,7 +137,8 @@ def rows_of(
     if len(rows) < _LEAST_ROWS:
         raise InvalidInput(
             f"{recording.source}: {len(rows)} moments of motion are left after filtering at {band.corner:.3g} Hz, "
-            f"of at least {_LEAST_ROWS}: record a longer motion"
+            f"of at least {_LEAST_ROWS} ({100.0 * np.mean(~recording.usable):.0f} % of the samples are missing, the "
+            f"axis rests in {100.0 * np.mean(motion.resting):.0f} %): record a longer motion without pauses"
         )
     position = recording.position[np.round(times * recording.rate).astype(int)]
     blocks, ends = _blocks(times, cycle, rows), len(SYMMETRIC) + len(ASYMMETRIC)
@@ -222,6 +233,7 @@ def least_squares(names: tuple[str, ...], design: Array, rows: Rows) -> Paramete
         values,
         np.sum(parts, axis=0) * np.outer(scale, scale),
         freedom,
+        np.zeros(values.size),
         float(np.linalg.norm(left) / np.linalg.norm(rows.force)),
         float(singular[0] / max(singular[-1], np.finfo(float).tiny)),
         rows.force.size,

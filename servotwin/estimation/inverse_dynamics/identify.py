@@ -33,6 +33,7 @@ from servotwin.estimation.inverse_dynamics.fit import (
 )
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
+from servotwin.estimation.inverse_dynamics.friction import FrictionForce, friction_forces
 from servotwin.estimation.inverse_dynamics.hidden_shaft import HiddenShaft, hidden_shaft
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
@@ -40,6 +41,7 @@ from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_res
 from servotwin.estimation.inverse_dynamics.slip import BeltSlip, belt_slip
 from servotwin.estimation.inverse_dynamics.tight_spot import tight_spot
 from servotwin.estimation.inverse_dynamics.unmodelled import Unmodelled, effects_of, unmodelled
+from servotwin.plant.signals import Array
 
 GivenLaw = GivenGains | GivenPid
 # Of the ways of reference and position: a loop that follows is within.
@@ -52,8 +54,6 @@ _LAW_COUNTS = 2.0
 # Of the command. Noise of a record, which the loop had not, left 0.02 to 0.08, and made lags of 0.4 to 4 samples of
 # none; late drives left 0.0003.
 _THAT_RAN = 0.005
-# Of the command, of a loop with that law: healthy machines left at most 0.03, a belt that sticks and slips 0.24.
-_UNKNOWN = 0.1
 _FIRST_LAG = 0.5  # samples
 
 
@@ -87,7 +87,9 @@ class IdentifiedDrive:
     tight : str
         Part of the travel with more friction, in the first recording; empty: none for sure.
     beside : str
-        What the simulated loop leaves of the command, where it is much and an effect beside the parameters explains it.
+        What the simulated loop leaves of the command, where it is much.
+    friction : tuple of FrictionForce
+        At the mean and the largest speed of the first recording, by the refinement if it converged.
     """
 
     symmetric: ParameterFit
@@ -104,6 +106,7 @@ class IdentifiedDrive:
     slip: str = ""
     tight: str = ""
     beside: str = ""
+    friction: tuple[FrictionForce, ...] = ()
 
 
 def identify_drive(
@@ -158,7 +161,8 @@ def identify_drive(
     advice = next_experiment(late.statistical if words else fits[0], every, motions[0], used[0].unit)
     hidden = hidden_shaft(used, motions, bands, late)
     found = found.with_shaft(hidden, late)
-    found = found.with_unmodelled(_effects(used, motions, bands, late))
+    effects = _effects(used, motions, bands, late)
+    found = found.with_unmodelled(effects)
     slip = belt_slip(used, motions, bands)
     found = found.with_slip(slip)
     spot = None if slip is not None else tight_spot(used[0], motions[0], bands[0])
@@ -180,6 +184,7 @@ def identify_drive(
         "" if slip is None else slip.remark(used[0].unit),
         "" if spot is None else spot.remark(used[0].unit),
         "" if slip is not None else found.beside(law),
+        found.friction(motions[0].speeds, effects),
     )
 
 
@@ -190,13 +195,13 @@ def _effects(
     late: CommandDelay,
 ) -> Unmodelled | None:
     """Effects beside the parameters and a delay, by the command."""
-    every = []
+    every, effects = [], []
     for recording, motion, band in zip(recordings, motions, bands, strict=True):
         part, moved = busiest(later(recording, late.delay), motion)
-        effects = effects_of(moved, band, part.position, late.symmetric)
-        extra = np.column_stack([derivative(part, part.force), effects.columns])
+        effects.append(effects_of(moved, band, part.position, late.symmetric))
+        extra = np.column_stack([derivative(part, part.force), effects[-1].columns])
         every.append(rows_of(part, moved, band, cycle_time(motion), extra))
-    return unmodelled(joined(every), effects)
+    return unmodelled(joined(every), effects[0])
 
 
 def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
@@ -245,26 +250,38 @@ class _Fits:
 
     def with_unmodelled(self, effects: Unmodelled | None) -> _Fits:
         """These, their intervals with what effects beside the parameters do, in a loop that comes to no rest too."""
-        fits, refined = (self.symmetric, self.asymmetric), self.refinement
-        unrest = None if refined is None or refined.converged else refined.effects
-        for each in (effects, unrest):
-            fits = fits if each is None else each.widened(fits)
+        fits = self.symmetric, self.asymmetric
+        for each in self._that_count(effects):
+            fits = each.widened(fits)
         return replace(self, symmetric=fits[0], asymmetric=fits[1])
+
+    def _that_count(self, effects: Unmodelled | None) -> list[Unmodelled]:
+        """Effects by inverse dynamics, and of a loop that comes to no rest.
+
+        What inverse dynamics leaves for no reason is noise, unless the loop does not follow the log either.
+        """
+        refined = self.refinement
+        unrest = None if refined is None or refined.converged else refined.effects
+        known = None if effects is None or not (effects.kinds or self.doubts) else effects
+        return [each for each in (known, unrest) if each is not None]
+
+    def friction(self, speeds: Array, effects: Unmodelled | None) -> tuple[FrictionForce, ...]:
+        """Friction at these speeds."""
+        refined = self.refinement
+        if refined is not None and refined.converged:
+            fit, every = refined.symmetric, [refined.effects] if refined.effects is not None else []
+        else:
+            fit, every = self.symmetric, self._that_count(effects)
+        return friction_forces(fit, speeds, sum((each.friction for each in every), np.zeros_like(speeds)))
 
     def beside(self, law: FittedLaw | None) -> str:
         """Sentence on effects beside the parameters; empty: none that matters."""
         refined = self.refinement
-        if refined is None or not refined.converged:
+        if refined is None or not refined.converged or refined.effects is None:
             return ""
-        if refined.effects is not None:
-            return refined.effects.remark(refined.symmetric)
-        left = refined.symmetric.relative_error
-        if left < _UNKNOWN or law is None or law.left > _THAT_RAN:
+        if not refined.effects.kinds and (law is None or law.left > _THAT_RAN):
             return ""
-        return (
-            f"inertia and friction leave {100.0 * left:.2g} % of the command, and nothing that was tried explains it: "
-            "the intervals may be too narrow; look for what slips, sticks or plays, and record a second encoder"
-        )
+        return refined.effects.remark(refined.symmetric)
 
     def with_slip(self, slip: BeltSlip | None) -> _Fits:
         """These, their intervals with what slip between motor and load does."""
@@ -291,7 +308,8 @@ class _Loop(NamedTuple):
         """Both models and their refinement, if there is one; a lag (s) is fitted where its first value is not 0."""
         if self.law is None:
             return _Fits(*fits, None, ())
-        found = refine(fits[0], self.law, self.recording, self.band, self.cycle, self.p, lag)
+        possible = fits[0]["inertia"] > 0.0
+        found = refine(fits[0], self.law, self.recording, self.band, self.cycle, self.p, lag) if possible else None
         if found is None:
             return _Fits(*fits, None, ("the simulated loop does not follow the log",))
         doubts = () if found.converged else ("the fit to the simulated motion did not converge",)
@@ -304,7 +322,8 @@ def _late(late: CommandDelay, loop: _Loop) -> tuple[_Fits, str]:
     behind = late.beyond_hold(rate)
     # Reversals hide a delay from inverse dynamics, and not from the simulated loop.
     that_ran = loop.law is not None and loop.law.left < _THAT_RAN
-    if behind == 0.0 and not that_ran:
+    # A delay that leaves no axis is none.
+    if (behind == 0.0 and not that_ran) or not fits[0]["inertia"] > 0.0:
         return _Fits(*fits, None, ()), ""
     found = loop.refined(fits, _FIRST_LAG / rate if behind == 0.0 else max(behind, 0.0))
     return found, delay_remark(late, found.lag if that_ran else None, rate, loop.band.corner)

@@ -71,6 +71,13 @@ class DriveRecording:
             return self.command_unit or "command"
         return "N m" if self.rotary else "N"
 
+    @property
+    def inertia_unit(self) -> str:
+        """Unit of the inertia that force and position make."""
+        if self.force_per_command is None:
+            return f"{self.force_unit} s^2/{self.unit}"
+        return "kg m^2" if self.rotary else "kg"
+
 
 def held_command(recording: DriveRecording) -> DriveRecording:
     """The recording with the force that moves the drive about each sample if the command is held from one to the next.

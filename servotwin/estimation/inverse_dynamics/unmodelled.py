@@ -17,10 +17,11 @@ import numpy as np
 from scipy import signal
 
 from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand
-from servotwin.estimation.inverse_dynamics.fit import ASYMMETRIC, SYMMETRIC, ParameterFit, Rows, regressors
+from servotwin.estimation.inverse_dynamics.fit import ASYMMETRIC, SYMMETRIC, ParameterFit, Rows
 from servotwin.plant.signals import Array
 
 _SLOW = (0.02, 0.06, 0.2)  # of the largest speed: within which friction falls from that of a start
+_LOADS = (1.0, 0.7, 0.4)  # of the inertia: the load's own part, whose force makes friction
 _LIMITS = (0.4, 0.6, 0.8)  # of the largest force: beyond which a clutch or a motor gives less
 _LAGS = (0.5, 2.0, 8.0, 32.0)  # rad: time constants of a load that creeps, times the corner
 _POWERS = 3  # of place and time
@@ -31,6 +32,9 @@ _LARGEST = 0.99  # quantile that counts as the largest force
 _EXPLAINS = 0.2
 _AS_WELL = 0.6  # of what the best effect explains: others that explain so much may as well be true
 _MOST = 3  # effects, one after the other
+# Of the force, of which nothing explains a part: healthy machines left at most 0.03, a belt that sticks and slips 0.24.
+_UNKNOWN = 0.1
+_OF_CHANCE = 0.5  # a 95 % interval has two standard deviations: belts that slip were off by up to 0.8 of that
 _MUCH = 0.03  # of the force: 32 healthy machines left at most 0.029 that effects explain
 _TINY = 1e-9  # of a column's square, so that columns that are none can be inverted
 
@@ -44,11 +48,16 @@ _ENDS = np.cumsum([len(SYMMETRIC), len(ASYMMETRIC)])
 
 
 class Effects(NamedTuple):
-    """Candidates: their kinds, and (n, c) regressors, of each the numbers in `members`."""
+    """Candidates: their kinds, and (n, c) regressors, of each the numbers in `members`.
+
+    `steady` (s, c) are the regressors at constant `speeds` (s,), half the difference of both directions.
+    """
 
     kinds: tuple[str, ...]
     members: tuple[tuple[int, ...], ...]
     columns: Array
+    speeds: Array
+    steady: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +67,11 @@ class Unmodelled:
     Attributes
     ----------
     kinds : tuple of str
+        Empty where much is left and nothing explains it.
     symmetric, asymmetric : (4,) and (5,) array
         By how much the parameters of both models differ with them.
+    friction : (s,) array
+        By how much the friction at the `speeds` of the effects does.
     explained : float
         Of the squares that the parameters leave.
     """
@@ -67,20 +79,27 @@ class Unmodelled:
     kinds: tuple[str, ...]
     symmetric: Array
     asymmetric: Array
+    friction: Array
     explained: float
 
     def widened(self, fits: tuple[ParameterFit, ParameterFit]) -> tuple[ParameterFit, ParameterFit]:
         """Both models, their intervals with these differences."""
         one, other = (
-            replace(fit, covariance=fit.covariance + np.diag(off**2))
+            replace(fit, beside=np.hypot(fit.beside, off))
             for fit, off in zip(fits, (self.symmetric, self.asymmetric), strict=True)
         )
         return one, other
 
     def remark(self, fit: ParameterFit) -> str:
         """One sentence on what a widened symmetric fit leaves; empty: little, or it hardly changes the parameters."""
+        if not self.kinds:
+            return (
+                f"inertia and friction leave {100.0 * fit.relative_error:.2g} % of the command, and nothing that was "
+                "tried explains it: the intervals contain what a force so large could do to each parameter; look for "
+                "what slips, sticks or plays, and record a second encoder"
+            )
         share = math.sqrt(self.explained) * fit.relative_error
-        before = np.diag(fit.covariance) - self.symmetric**2
+        before = np.diag(fit.covariance)
         if share < _MUCH or not np.any(self.symmetric[:-1] ** 2 > before[:-1]):
             return ""
         return (
@@ -90,44 +109,80 @@ class Unmodelled:
         )
 
 
+class _Moment(NamedTuple):
+    """(n,) acceleration, speed and its sign."""
+
+    acceleration: Array
+    speed: Array
+    side: Array
+
+    def force(self, fit: ParameterFit, share: float = 1.0) -> Array:
+        """(n,) force of a symmetric fit, of its inertia a share."""
+        inertial = share * fit["inertia"] * self.acceleration
+        return inertial + fit["viscous"] * self.speed + fit["coulomb"] * self.side + fit["offset"]
+
+
 def effects_of(motion: DriveMotion, band: RegressionBand, position: Array, fit: ParameterFit) -> Effects:
     """Candidates along a motion; the force that some of them follow is that of the symmetric fit, without noise."""
-    force = regressors(motion)[:, : len(SYMMETRIC)] @ fit.only(SYMMETRIC).values
-    speed, side = motion.speed, np.where(motion.resting, 0.0, motion.side)
-    fast, top = np.abs(speed), float(np.abs(speed).max())
-    largest = float(np.quantile(np.abs(force), _LARGEST))
+    side = np.where(motion.resting, 0.0, motion.side)
+    moving, speeds = _Moment(motion.acceleration, motion.speed, side), motion.speeds
+    both = np.concatenate([speeds, -speeds])
+    steady = _Moment(np.zeros(both.size), both, np.sign(both))
+    force = moving.force(fit)
+    ends = float(np.abs(motion.speed).max()), float(np.quantile(np.abs(force), _LARGEST))
+    of_moment, at_speeds = (_of_the_moment(each, fit, *ends) for each in (moving, steady))
     place, time = _powers(position), _powers(np.arange(position.size, dtype=float))
-    crept = force * fast
-    tried = [
-        (SPEED, speed * fast),
-        *((SPEED, side * np.exp(-fast / (slow * top))) for slow in _SLOW),
+    changing = [
         (PLACE, place),
         (PLACE, side[:, None] * place),
         (TIME, time),
         (TIME, side[:, None] * time),
-        (FORCE, side * np.abs(force)),
-        (FORCE, force**3),
-        *((FORCE, force - np.clip(force, -limit * largest, limit * largest)) for limit in _LIMITS),
-        (SLIP, np.column_stack([crept, np.gradient(crept, 1.0 / motion.rate)])),
         *((SLIP, _behind(motion, lag / (2.0 * math.pi * band.corner))) for lag in _LAGS),
-        (LOADED, np.gradient(np.gradient(motion.acceleration, 1.0 / motion.rate), 1.0 / motion.rate)),
+        (LOADED, np.gradient(np.gradient(motion.acceleration, 1.0 / motion.rate), 1.0 / motion.rate)[:, None]),
     ]
-    ends = np.cumsum([0, *(1 if each.ndim == 1 else each.shape[1] for _, each in tried)])
-    members = tuple(tuple(range(begin, end)) for begin, end in pairwise(ends))
-    return Effects(tuple(kind for kind, _ in tried), members, np.column_stack([each for _, each in tried]))
+    crept, crept_there = (each.force(fit) * np.abs(each.speed) for each in (moving, steady))
+    creep = np.column_stack([crept, np.gradient(crept, 1.0 / motion.rate)])
+    tried = [*of_moment, (SLIP, creep), *changing]
+    ends_of = np.cumsum([0, *(each.shape[1] for _, each in tried)])
+    columns = np.column_stack([each for _, each in tried])
+    there = np.zeros((both.size, columns.shape[1]))
+    there[:, : len(of_moment) + 1] = np.column_stack([*(each for _, each in at_speeds), crept_there])
+    return Effects(
+        tuple(kind for kind, _ in tried),
+        tuple(tuple(range(begin, end)) for begin, end in pairwise(ends_of)),
+        columns,
+        speeds,
+        0.5 * (there[: speeds.size] - there[speeds.size :]),
+    )
+
+
+def _of_the_moment(at: _Moment, fit: ParameterFit, top: float, largest: float) -> list[tuple[str, Array]]:
+    """Kinds and (n, 1) regressors that follow speed and force of the moment, by the largest of both in a log."""
+    force, fast = at.force(fit), np.abs(at.speed)
+    return [
+        (kind, column[:, None])
+        for kind, column in (
+            (SPEED, at.speed * fast),
+            *((SPEED, at.side * np.exp(-fast / (slow * top))) for slow in _SLOW),
+            *((FORCE, at.side * np.abs(at.force(fit, share))) for share in _LOADS),
+            (FORCE, force**3),
+            *((FORCE, force - np.clip(force, -limit * largest, limit * largest)) for limit in _LIMITS),
+        )
+    ]
 
 
 def unmodelled(rows: Rows, effects: Effects) -> Unmodelled | None:
-    """The effects that explain most, one after the other; None: none explains blocks of time that it has not seen.
+    """The effects that explain most, one after the other; None: little is left, or noise.
 
     The last extra columns of the rows are the effects'; those before them belong to all models. Other effects that
-    explain nearly as much may as well be true: the differences are the largest of all these.
+    explain nearly as much may as well be true: the differences are the largest of all these. Where much is left and
+    none explains blocks of time that it has not seen, they are those of a force as large as what is left.
     """
     squares = _Squares.of(rows)
     first = int(_ENDS[-1]) + rows.extra.shape[1] - effects.columns.shape[1]
     members = [[first + each for each in group] for group in effects.members]
     shared = list(range(int(_ENDS[-1]), first))
-    symmetric, asymmetric = list(range(_ENDS[0])), list(range(_ENDS[0], _ENDS[1]))
+    symmetric = list(range(_ENDS[0]))
     added: list[int] = []
     likely: list[list[int]] = []
     kinds: list[str] = []
@@ -141,15 +196,48 @@ def unmodelled(rows: Rows, effects: Effects) -> Unmodelled | None:
         likely += [added + each for each, rest in zip(members, tried, strict=True) if rest <= enough]
         kinds.append(effects.kinds[best])
         added, left = added + members[best], tried[best]
-    if not likely:
+    if likely:
+        off = _differences(squares, shared, likely, np.column_stack([_steady(effects.speeds), effects.steady]))
+    elif bare > _UNKNOWN**2:
+        off = _of_chance(squares, shared, bare, _steady(effects.speeds))
+    else:
         return None
+    return Unmodelled(tuple(dict.fromkeys(kinds)), *off, 1.0 - left / bare)
+
+
+def _steady(speeds: Array) -> Array:
+    """(s, 4) symmetric regressors at constant speeds, half the difference of both directions."""
+    none = np.zeros_like(speeds)
+    return np.column_stack([none, speeds, np.ones_like(speeds), none])
+
+
+def _differences(
+    squares: _Squares, shared: list[int], likely: list[list[int]], steady: Array
+) -> tuple[Array, Array, Array]:
+    """Largest differences that effects make to both models and to the friction, at (s, 4 + c) steady regressors."""
 
     def largest(own: list[int]) -> Array:
         plain = squares.values(own + shared)[: len(own)]
         others = np.array([squares.values(own + shared + extra)[: len(own)] for extra in likely])
         return np.asarray(np.abs(others - plain).max(axis=0))
 
-    return Unmodelled(tuple(dict.fromkeys(kinds)), largest(symmetric), largest(asymmetric), 1.0 - left / bare)
+    symmetric, asymmetric = list(range(_ENDS[0])), list(range(_ENDS[0], _ENDS[1]))
+    ends = len(symmetric), int(_ENDS[1]) + len(shared)
+    plain = steady[:, symmetric] @ squares.values(symmetric + shared)[symmetric]
+    friction = []
+    for extra in likely:
+        values = np.delete(squares.values(symmetric + shared + extra), range(ends[0], ends[0] + len(shared)))
+        there = steady[:, [*symmetric, *(each - ends[1] + ends[0] for each in extra)]]
+        friction.append(np.abs(there @ values - plain))
+    return largest(symmetric), largest(asymmetric), np.max(friction, axis=0)
+
+
+def _of_chance(squares: _Squares, shared: list[int], left: float, steady: Array) -> tuple[Array, Array, Array]:
+    """Standard deviations of both models and of the friction: half of what a force as large as what is left makes."""
+    symmetric, asymmetric = list(range(_ENDS[0])), list(range(_ENDS[0], _ENDS[1]))
+    left *= _OF_CHANCE**2
+    one, other = (squares.spread(own + shared, left)[: len(own), : len(own)] for own in (symmetric, asymmetric))
+    return np.sqrt(np.diag(one)), np.sqrt(np.diag(other)), np.sqrt(np.einsum("si,ij,sj->s", steady, one, steady))
 
 
 class _Squares(NamedTuple):
@@ -168,6 +256,12 @@ class _Squares(NamedTuple):
     def values(self, columns: list[int]) -> Array:
         """Least squares of the force on these columns."""
         return _solved(self.products.sum(axis=0), columns) * self.scale[-1] / self.scale[columns]
+
+    def spread(self, columns: list[int], left: float) -> Array:
+        """Covariance of these by one force of such squares, of all of the command's 1, along each of them."""
+        gram = self.products.sum(axis=0)[np.ix_(columns, columns)] + _TINY * np.eye(len(columns))
+        units = self.scale[-1] / self.scale[columns]
+        return np.asarray(left * np.linalg.inv(gram) * np.outer(units, units))
 
     def foreseen(self, columns: list[int]) -> float:
         """Squares left in each block by a fit to all others, summed up; of all of the force's: 1."""
@@ -190,6 +284,7 @@ def _powers(values: Array) -> Array:
 
 
 def _behind(motion: DriveMotion, lag: float) -> Array:
-    """Acceleration of a load that follows with a time constant (s), less the motor's."""
+    """(n, 1) acceleration of a load that follows with a time constant (s), less the motor's."""
     share = -math.expm1(-1.0 / (motion.rate * lag))
-    return np.asarray(signal.lfilter([share], [1.0, share - 1.0], motion.acceleration) - motion.acceleration)
+    behind = signal.lfilter([share], [1.0, share - 1.0], motion.acceleration) - motion.acceleration
+    return np.asarray(behind)[:, None]
