@@ -19,6 +19,7 @@ from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.identify import GivenLaw, IdentifiedDrive, identify_drive
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse
+from servotwin.logs.cleaning import SHARED
 from servotwin.logs.clocks import WHOLE
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
@@ -139,12 +140,17 @@ def commission(
 
 
 def _identified(logs: Sequence[DriveLog], gains: GivenLaw, travel: float, applied: bool) -> IdentifiedDrive:
-    """The drive that the logs show; a refusal names times whose unit was assumed."""
+    """The drive that the logs show; a refusal names times whose unit or place was assumed."""
     try:
         return identify_drive([log.recording for log in logs], gains, travel, applied)
     except InvalidInput as error:
         if any(WHOLE in log.found for log in logs):
             raise InvalidInput(f"{error}; or its {WHOLE}") from None
+        if shared := sum(log.found.get(SHARED, 0) for log in logs):
+            raise InvalidInput(
+                f"{error}; {shared} of its samples have the time stamp of the one before: give --rate in Hz, or record "
+                "finer stamps"
+            ) from None
         raise
 
 

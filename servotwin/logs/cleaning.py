@@ -23,6 +23,7 @@ _STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
 _SLOWER = 0.95  # share of a slower channel's samples that follow the one before after equally many rows
 
 
+SHARED = "samples with the time stamp of the one before, spread between stamps"
 OUT_OF_ORDER, SAME_TIME = "samples out of order in time", "samples at the time of the one before"
 REPEATED = "samples that repeat the one before in every column"
 BETWEEN = "rows between the samples of a slower channel"
@@ -91,7 +92,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     keep(~_alone_at_the_end(table[:, 0]), "samples with a time stamp far behind all others")
     table[:, 0], shared = spread(table)
     if shared:
-        found["samples with the time stamp of the one before, spread between stamps"] = shared
+        found[SHARED] = shared
     keep(np.diff(table[:, 0], prepend=-np.inf) > 0.0, SAME_TIME)
     parted: list[float] = []
     for place, name in enumerate(names, 1):

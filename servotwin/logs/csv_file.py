@@ -28,6 +28,7 @@ _POINT = re.compile(r"[+-]?\d*\.\d*(e[+-]?\d+)?$", re.IGNORECASE)
 _COMMA = re.compile(r"(^|[^\d.,])[+-]?(\d+|\d{1,3}(\.\d{3})+),\d+($|[^\d.,])")
 _LONGEST_CELL = 2**31 - 1
 """Characters: the metadata of a log, with its scenario, are one cell; Python's own limit is 131072."""
+_GZIP = b"\x1f\x8b"
 _BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
 
 
@@ -175,7 +176,8 @@ def _encoding(path: Path) -> str:
         return "utf-16-le"
     if any(byte < 9 or 13 < byte < 32 for byte in begin):
         place = next(i for i, byte in enumerate(begin) if byte < 9 or 13 < byte < 32)
-        raise InvalidInput(f"log {path}: is not a text file (byte {place} is binary data)")
+        packed = "; it is packed by gzip: unpack it first" if begin.startswith(_GZIP) else ""
+        raise InvalidInput(f"log {path}: is not a text file (byte {place} is binary data){packed}")
     try:
         begin.decode("utf-8")
     except UnicodeDecodeError as error:

@@ -23,6 +23,8 @@ from servotwin.logs.recordings import CUT, TIME_NAMES, TURNED, check_left, check
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
+_OVERFLOW, _OVERFLOWS = 0.7, 2  # of a column's range, and so many times
+_SPIKE = 5  # samples: jumps closer together are a spike
 _SAME = math.log(1.2)  # of two ways
 _OTHER_UNIT = math.log(20.0)  # of two ways; a radian is 57.3 degrees
 _HELD = 2.5  # usual intervals: nothing is known of the motion within a longer one
@@ -125,6 +127,9 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
     turned = is_newest_first(time)
     if turned:
         time, arrays = time[::-1], {part: values[::-1] for part, values in arrays.items()}
+    for part in {"motor", "load"}.intersection(arrays):
+        if units[part] in LENGTHS:
+            _check_counter(path, part, chosen[part], arrays[part])
     turns = {part: 2.0 * math.pi / ANGLES[units[part]] for part in arrays if units[part] in ANGLES}
     try:
         clean = cleaned(time, arrays, turns)
@@ -192,6 +197,22 @@ def _in_si(
         source=f"log {path}",
     )
     return replace(log, recording=recording, travel=travel, lost_motion=lost)
+
+
+def _check_counter(path: Path, part: str, column: str, values: Array) -> None:
+    """Refuse lengths of a counter that overflows: they jump by most of their range, and not back at once."""
+    known = values[np.isfinite(values)]
+    jumps = np.flatnonzero(np.abs(np.diff(known)) > _OVERFLOW * np.ptp(known)) if known.size else known
+    alone = np.diff(jumps, prepend=-np.inf) > _SPIKE
+    alone &= np.diff(jumps, append=np.inf) > _SPIKE
+    count = int(np.sum(alone))
+    # Rows in disorder jump everywhere.
+    if count >= max(_OVERFLOWS, jumps.size // 2):
+        raise InvalidInput(
+            f"log {path}: column {column!r} jumps by most of its range of {np.ptp(known):.4g} {count} times: its "
+            f"counter overflows; make it one length, or, if it counts turns, say so (--{part}-unit rev/4096), and they "
+            "are counted"
+        )
 
 
 def _check_kinds(path: Path, units: Mapping[str, str], columns: Mapping[str, str]) -> None:

@@ -25,6 +25,11 @@ _OTHER_UNITS = (
     *("rev", "revs", "turn", "turns", "counts", "mv", "kv"),
 )
 """Units in which others write logs, as the ends of columns' names."""
+_PACKED, _WORKBOOK = "unpack it first; ", "export its sheet as .csv first; "
+_TO_CONVERT = {
+    **dict.fromkeys((".gz", ".zip", ".bz2", ".xz", ".zst", ".7z"), _PACKED),
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), _WORKBOOK),
+}
 _OTHER_TIMES = ("ms", "us", "ns", "min", "h")
 _COLUMN_NAMES = (TIME, *(name for names in SIGNAL_COLUMNS.values() for name in names))
 
@@ -108,7 +113,8 @@ def read_blocks(path: Path, requested: Requested) -> Iterator[LogColumns]:
 def _reading(path: Path, requested: Requested, whole: bool) -> Iterator[LogColumns]:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
+        known = f"the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}"
+        raise InvalidInput(f"log {path}: {_TO_CONVERT.get(suffix, '')}{known}")
     check_named(path, "log ")
     if not path.is_file():
         raise InvalidInput(f"log {path}: is not there; give the name of a file")

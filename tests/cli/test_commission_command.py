@@ -172,9 +172,9 @@ def test_without_a_scale_a_known_mass_gives_it(tmp_path):
     ("change", "options", "says"),
     [
         ({"force": np.zeros(simulated().position.size)}, (), "the command is 0 N throughout"),
-        ({"motor": np.zeros(simulated().position.size)}, (), "the position moves by 0 m only"),
+        ({"motor": np.zeros(simulated().position.size)}, (), "the position is 0 m throughout"),
         ({"force": -simulated().force}, (), "acts against the motion"),
-        ({}, ("--motor", "force", "--motor-unit", "mm", "--command", "motor"), "of the command only"),
+        ({}, ("--motor", "force", "--motor-unit", "mm", "--command", "motor"), "--motor and --command mixed up"),
         ({}, ("--motor", "reference", "--reference", "motor"), "swapped"),
         ({}, ("--command", "motor"), "named twice"),
         ({}, ("--command", "torque"), "there is no such column"),

@@ -10,6 +10,8 @@ from drive_recordings import GAINS, PARAMETERS, elastic, prescribed, recording_o
 
 import servotwin as st
 from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics import identify
+from servotwin.estimation.inverse_dynamics.command_delay import fitted_delay
 from servotwin.estimation.inverse_dynamics.conditioning import band_of
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.identify import identify_drive
@@ -142,7 +144,7 @@ ONE_WAY = recording_of(np.cumsum(SPEED + 1e-5), 3.0 + 1e4 * SPEED + 1e5 * np.gra
 @pytest.mark.parametrize(
     ("recording", "says"),
     [
-        (refused(position=lambda each: np.zeros(each.position.size)), "moves by 0 m only"),
+        (refused(position=lambda each: np.zeros(each.position.size)), "is 0 m throughout"),
         (refused(force=lambda each: np.full(each.position.size, 2.0)), "the command is 2 N throughout"),
         (refused(force=lambda each: -each.force), "acts against the motion"),
         (
@@ -256,3 +258,16 @@ def test_a_fit_that_runs_away_is_left_for_the_one_before_the_simulation():
     assert drive.refinement is None
     assert drive.doubts == ("the simulated loop does not follow the log",)
     assert drive.symmetric["inertia"] > 0.0
+
+
+def test_a_delay_with_which_the_inertia_would_be_negative_is_none(monkeypatch):
+    """Its loop cannot be simulated, and the parameters are those of the command as it was logged."""
+
+    def fitted(*recorded):
+        late = fitted_delay(*recorded)
+        return replace(late, symmetric=replace(late.symmetric, values=-late.symmetric.values))
+
+    monkeypatch.setattr(identify, "fitted_delay", fitted)
+    drive = identify_drive([simulated()], p=1e-3)
+    assert drive.late == ""
+    assert drive.refinement.symmetric["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=1e-3)
