@@ -303,3 +303,25 @@ def test_margins_of_a_loop_with_a_delay_are_the_same_in_another_unit_of_time(tim
     )
     assert other.Ms == pytest.approx(one.Ms, rel=1e-9)
     assert len(other.phase_crossovers) == len(one.phase_crossovers) > 1
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [
+        ("telescope", AxisUnits(time=2.0**10)),
+        ("robot-joint", AxisUnits(time=2.0**-10, torque=2.0**6)),
+        ("stepper-stage", AxisUnits(time=2.0**10, length=2.0**-20)),
+    ],
+)
+def test_an_axis_is_tuned_alike_in_other_units(name, units):
+    axis = Axis.preset(name)
+    crossover = axis.margins().gain_crossovers[0].omega
+    one, other = (
+        tune_plant(plant, crossover / time, math.radians(55.0))
+        for plant, time in ((axis, 1.0), (scaled_axis(axis, units), units.time))
+    )
+    assert other.factors.al == pytest.approx(one.factors.al, rel=1e-6)
+    assert other.margins.Ms == pytest.approx(one.margins.Ms, rel=1e-6)
+    assert other.controller.Ki * (units.time * one.controller.Kp) == pytest.approx(
+        one.controller.Ki * other.controller.Kp, rel=1e-6
+    )

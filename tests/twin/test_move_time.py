@@ -3,12 +3,13 @@
 import math
 
 import pytest
-from scaling import Units, scaled
+from scaling import AxisUnits, Units, scaled, scaled_axis
 
 import servotwin as st
 from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.commissioning.move_time import move_time
 from servotwin.plant.scales import scales
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.twin.settings import TwinSettings
 
 STAGE = st.Axis(
@@ -50,6 +51,19 @@ def test_a_servo_a_thousand_times_slower_takes_a_thousand_times_as_long() -> Non
     slow = scaled(servo, *units)
     taken = [move_time(each, each.controller, 0.0, 1e-3, 10.0 * second) for each, second in ((servo, 1.0), (slow, 1e3))]
     assert taken[1] == pytest.approx(1e3 * taken[0], rel=1e-2)
+
+
+@pytest.mark.parametrize("name", ["telescope", "robot-joint", "stepper-stage", "emps"])
+def test_the_windows_of_an_axis_in_other_units_last_as_long(name: str) -> None:
+    axis, units = st.Axis.preset(name), AxisUnits(time=2.0**-10, length=2.0**20, torque=2.0**6)
+    lasted = []
+    for each, time, length in ((axis, 1.0, 1.0), (scaled_axis(axis, units), units.time, units.length)):
+        # A rotary load counts angles.
+        size = 2.5e-3 * (1.0 if axis.load.motion == "rotary" else length)
+        twin = TwinSettings(policy="paper", uncertainty=Uncertainty().replace(step=(0.04 * size, size)))
+        found = Commissioning(each, each.controller, twin, Recording(each.controller.sample_rate))
+        lasted.append((found.window / time, found.pre_trigger / time))
+    assert lasted[1] == pytest.approx(lasted[0], rel=1e-6)
 
 
 def edge(window: float | None = None) -> Commissioning:

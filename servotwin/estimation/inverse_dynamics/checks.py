@@ -186,7 +186,8 @@ def check_sense(recording: DriveRecording, fit: ParameterFit) -> None:
         raise InvalidInput(
             f"{recording.source}: the inertia does not show ({inertia:.3g} ± {half:.2g} {unit}, 95 %), although "
             f"inertia and friction explain {100.0 * (1.0 - fit.relative_error**2):.0f} % of the command: record longer "
-            "strokes at several speeds, whose accelerations last for many samples; or are --motor and --command mixed up?"
+            "strokes at several speeds, whose accelerations last for many samples; or are --motor and --command mixed "
+            "up?"
         )
     if fit.relative_error > _UNEXPLAINED:
         raise InvalidInput(

@@ -51,6 +51,15 @@ def test_the_simulated_loop_is_refined_as_often(time, length, force):
 
 
 @pytest.mark.parametrize(("time", "length", "force"), UNITS)
+def test_the_friction_at_the_speeds_of_the_log_is_the_same(time, length, force):
+    one, other = (identified(prescribed(1), *units).friction for units in ((), (time, length, force)))
+    for each, alike in zip(one, other, strict=True):
+        assert alike.speed * time / length == pytest.approx(each.speed, rel=1e-9)
+        assert alike.force / force == pytest.approx(each.force, rel=1e-6)
+        assert alike.half_width / force == pytest.approx(each.half_width, rel=1e-6)
+
+
+@pytest.mark.parametrize(("time", "length", "force"), UNITS)
 def test_the_next_experiment_is_the_same(time, length, force):
     one, other = (identified(prescribed(1), *units).advice for units in ((), (time, length, force)))
     assert other.worst == one.worst
