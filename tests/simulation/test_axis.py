@@ -279,6 +279,18 @@ def test_a_shaft_without_damping_closes_its_gap_without_a_pull() -> None:
     assert np.all(np.isfinite(step_window(drawn, 2).position))
 
 
+def test_the_twist_that_a_damped_shaft_keeps_at_release_fades_in_the_gap() -> None:
+    """With damping over stiffness, in closed form, behind every release."""
+    shaft, gap = Transmission(p=1.0, k_d=3300.0, c_d=12.0, in_gap="free"), 0.03
+    run = simulate(TWO_MASS.replace(transmission=shaft), 1.5, reference=0.2, gap=gap, sample_rate=4000.0)
+    twist = shaft.p * run.theta_d - run.q[:, 0]
+    open_ = np.abs(run.theta_m - run.theta_d) < 0.5 * gap * (1.0 - 1e-9)
+    left = twist[1:] - twist[:-1] * math.exp(-shaft.k_d / shaft.c_d / 4000.0)
+    both, size = open_[1:] & open_[:-1], np.abs(twist).max()
+    assert np.abs(left[both]).max() < 1e-9 * size
+    assert np.abs(twist[1:][both]).max() > 0.1 * size
+
+
 def test_without_a_rate_every_preset_is_recorded_at_one_that_its_controller_allows() -> None:
     rates = {name: simulate(Axis.preset(name), 0.01).sample_rate for name in PRESETS}
     assert rates["two-mass-drive"] == 2000.0

@@ -1,4 +1,6 @@
-"""Linear laws on axes, sampled and continuous, against scipy's integrator and a law in numpy."""
+"""Linear laws on axes, sampled and continuous, against scipy's integrator and a law in numpy; filtered PIDs too."""
+
+import math
 
 import numpy as np
 import pytest
@@ -6,8 +8,10 @@ from exploration import explored
 from law_oracle import ContinuousOracle, continuous_positions, numpy_law, sampled_positions
 from test_axis import TWO_MASS
 
+from servotwin.control.controller import Controller
 from servotwin.control.linear_law import LinearLaw
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
+from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 
 RATE = 200.0
@@ -112,3 +116,37 @@ def test_a_sampled_tick_tends_to_the_continuous_law(name: str) -> None:
     exact = position(law)
     errors = [np.abs(position(law.replace(sample_rate=rate)) - exact).max() for rate in (2e4, 1e5)]
     assert errors[1] < 0.3 * errors[0] < 0.002
+
+
+def matrices(pid: Controller) -> LinearLaw:
+    """A filtered PID with low-pass and notch written anew: states integral, derivative, filtered, band, low.
+
+    The notch is (s^2 + 2 depth zeta w s + w^2) / (s^2 + 2 zeta w s + w^2) behind the three actions.
+    """
+    assert pid.loop_filter_hz is not None
+    slope, omega, rate = pid.Kd / pid.Tf, 2.0 * math.pi * pid.notch_hz, 2.0 * math.pi * pid.loop_filter_hz
+    actions, reference = np.array([1.0, -slope, -(pid.Kp + slope), 0.0, 0.0]), pid.Kp + slope
+    A, B = np.zeros((5, 5)), np.zeros((5, 3))
+    A[0, 2], B[0, 0] = -pid.Ki, pid.Ki
+    A[1, 1:3], B[1, 0] = -1.0 / pid.Tf, 1.0 / pid.Tf
+    A[2, 2], B[2, 2] = -rate, rate
+    A[3], B[3, 0] = omega * (actions - [0.0, 0.0, 0.0, 2.0 * pid.notch_damping, 1.0]), omega * reference
+    A[4, 3] = omega
+    C = actions - [0.0, 0.0, 0.0, 2.0 * pid.notch_damping * (1.0 - pid.notch_depth), 0.0]
+    return LinearLaw(A=A.tolist(), B=B.tolist(), C=C.tolist(), D=[reference, 0.0, 0.0])
+
+
+@pytest.mark.slow
+def test_a_filtered_pid_with_low_pass_and_notch_agrees_with_an_independent_integrator() -> None:
+    """Its load knocks from flank to flank, and meets one again before the shaft's twist has faded."""
+    shaft = Transmission(p=1.0, k_d=3300.0, c_d=12.0, in_gap="free")
+    pid = Controller(40.0, 0.2, 25.0, 0.02, loop_filter_hz=30.0, notch_hz=11.0, notch_damping=0.5, notch_depth=0.1)
+    axis, gap = TWO_MASS.replace(controller=pid, transmission=shaft), 0.03
+    run = simulate(axis, 6.0, reference=SquareWave(0.2, 6.0), gap=gap, sample_rate=100.0)
+    oracle = ContinuousOracle(axis, gap, law=matrices(pid))
+    expected = continuous_positions(oracle, 0.2, 3.0, run.time[:-1])
+    assert np.abs(run.position[:-1] - expected).max() < 1e-8 * np.ptp(expected)
+    changes = run.events[np.isin(run.events.kind, ("contact", "release"))]
+    assert changes.time == pytest.approx(oracle.changes, abs=1e-6)
+    apart = np.diff(changes.time)[changes.kind[:-1] == "release"]
+    assert apart.min() < 3.0 * shaft.c_d / shaft.k_d
