@@ -1,4 +1,4 @@
-"""Loads that friction in the gap carries: they follow their motor, and the gap does not show."""
+"""What looks like another gap: a load that friction in the gap carries, and walls much softer than the stated shaft."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from servotwin.control.cascade import Cascade
-from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.joint.estimator import estimate_jointly
 from servotwin.estimation.window import Window
@@ -59,3 +59,45 @@ def test_a_load_that_a_flank_carries_shows_that_there_is_no_gap() -> None:
     found = estimate_gap(window(LEAD * run.theta_m, run.position), AXIS)
     assert found.status is GapStatus.OK
     assert LEAD * found.interval[1] < 5.0 * COUNT
+
+
+def estimate_behind(softer: float, friction: float, gap: float, size: float) -> GapEstimate:
+    """Of a machine with a shaft so many times softer than stated, its load's friction (N) and gap (m), in strokes of a
+    size over 1 mm."""
+    stated = AXIS.replace(load=Load((10.0,), (0.0,), (20.0,), friction=friction))
+    stiffness = AXIS.transmission.k_d / softer
+    damping = AXIS.transmission.c_d if softer == 1.0 else 0.2 * math.sqrt(10.0 * stiffness)
+    machine = stated.replace(
+        transmission=Transmission(LEAD, stiffness, damping, in_gap="free"),
+        controller=Cascade(6.0, LEAD, 900.0 * LEAD**2, on="motor", speed_filter=2e-3, sample_rate=RATE),
+    )
+    way = size * strokes()
+    reference = Samples(tuple(k / RATE for k in range(way.size)), tuple(way))
+    run = simulate(machine, (way.size - 1) / RATE, reference=reference, gap=gap / LEAD, sample_rate=RATE)
+    return estimate_gap(window(LEAD * run.theta_m, run.position), stated)
+
+
+@pytest.mark.parametrize(("friction", "gap"), [(0.05, 20e-6), (0.1, 20e-6), (0.1, 40e-6)])
+def test_friction_that_winds_up_a_soft_wall_bounds_no_gap(friction: float, gap: float) -> None:
+    found = estimate_behind(30.0, friction, gap, 0.1)
+    assert found.status is GapStatus.UNIDENTIFIABLE
+    assert "a shaft much softer than the stated one" in "; ".join(found.reasons)
+
+
+def test_a_gap_between_soft_walls_is_not_that_of_the_stated_shaft() -> None:
+    """It was 114 within 22 um."""
+    found = estimate_behind(20.0, 0.0, 80e-6, 0.3)
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert "times softer than the stated one explains the window better" in "; ".join(found.reasons)
+
+
+def test_a_shaft_as_stated_shows_its_gap() -> None:
+    found = estimate_behind(1.0, 0.0, 80e-6, 0.3)
+    assert found.status is GapStatus.OK
+    assert LEAD * found.gap == pytest.approx(80e-6, abs=3.0 * COUNT)
+
+
+def test_a_shaft_as_stated_bounds_its_gap() -> None:
+    found = estimate_behind(1.0, 0.05, 150e-6, 0.1)
+    assert found.status is GapStatus.LOWER_BOUND
+    assert LEAD * found.gap < 150e-6

@@ -35,9 +35,7 @@ def smallest_half(found: Search, single: Fit) -> float:
     single : Fit
         The best one in which the motor touches one flank only.
     """
-    fits = [found.best, single, *found.others]
-    limit = min(fit.cost for fit in fits) + _EXCLUDED * found.best.variance()
-    likely = [fit for fit in fits if fit.cost <= limit]
+    likely, limit = likely_fits(found, single)
     # One flank is the same whatever is beyond the motor's way.
     top = min([0.5 * found.problem.range, *(float(fit.values[HALF]) for fit in likely)])
     below, above = 0.0, top
@@ -53,6 +51,13 @@ def smallest_half(found: Search, single: Fit) -> float:
         else:
             below = middle
     return below
+
+
+def likely_fits(found: Search, single: Fit) -> tuple[list[Fit], float]:
+    """Minima that explain a window, the best one with one flank among them, and the largest cost of such a fit."""
+    fits = [found.best, single, *found.others]
+    limit = min(fit.cost for fit in fits) + _EXCLUDED * found.best.variance()
+    return [fit for fit in fits if fit.cost <= limit], limit
 
 
 def _explains(found: Search, half: float, like: list[Fit], limit: float) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.between_samples import error_between_samples, moved_between_samples
-from servotwin.estimation.output_error.bound import smallest_half
+from servotwin.estimation.output_error.bound import likely_fits, smallest_half
 from servotwin.estimation.output_error.carried import carried
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
@@ -22,6 +22,7 @@ from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
+from servotwin.estimation.output_error.softer_shaft import softer_explains, softer_is_better
 from servotwin.estimation.output_error.unexplained import unexplained
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
@@ -98,6 +99,8 @@ def judge(
     doubts, explained = _doubts(found, known, allowed, unit, settings.friction)
     if not doubts and _out_of_reach(found, known.half + NORMAL_95 * explained):
         return _bounded(found, single, "the interval contains gaps that the motor does not cross in the window")
+    if not doubts and (softer := softer_is_better(found)):
+        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(softer,))
     if not doubts:
         return JudgedFit(GapStatus.OK, known.half, known.std, explained)
     ratio = None
@@ -145,8 +148,12 @@ def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
     """Decide on a window that shows one flank, for a reason in words."""
     count = found.problem.count
     hidden = _hidden_friction(found, single) + float(np.max(error_between_samples(found, _FEW)))
-    bound = _BOUND * 2.0 * (smallest_half(found, single) - hidden) - count
+    half = smallest_half(found, single)
+    bound = _BOUND * 2.0 * (half - hidden) - count
     enough = bound > _BOUND_COUNTS * count
+    if enough and softer_explains(found, half, *likely_fits(found, single)):
+        softer = "a shaft much softer than the stated one, which friction winds up, explains it with a smaller gap"
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words, softer))
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
     return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
 
