@@ -6,7 +6,7 @@ Commands that read a store check its pages for a second, and end with the same s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from servotwin.store.encoded_contents import encoding_faults
 from servotwin.store.engine import POSTGRESQL, SQLITE, StoreUnavailable
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
 from servotwin.store.store import Store
+from servotwin.store.stored_value import WrongRow
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.store_mark import lost_messages
 from servotwin.twin_service.twin_file import service_of
@@ -50,10 +51,7 @@ def store_to_read(config: Path) -> Iterator[Store]:
     InvalidInput
         The store is damaged, has lost messages, or cannot be opened.
     """
-    with (
-        closing(open_existing_store(service_of(config))) as store,
-        telling_after(lambda: _require_whole(store, config, _READING_S)),
-    ):
+    with closing(open_existing_store(service_of(config))) as store, telling_after(lambda: _require_all(store, config)):
         yield store
 
 
@@ -66,6 +64,20 @@ def telling_after(require_sound: Callable[[], None]) -> Iterator[None]:
         require_sound()
         raise
     require_sound()
+
+
+def _require_all(store: Store, config: Path) -> None:
+    """Check the pages for a moment, and that no servo is left out."""
+    _require_whole(store, config, _READING_S)
+    if store.aside:
+        raise InvalidInput(
+            f"store {store.name}: servos that are set aside are left out ({_clauses(store.aside.values())}): put their "
+            "rows right or delete them, as the operator's guide says; the twin takes them back by itself"
+        )
+
+
+def _clauses(wrong: Iterable[WrongRow]) -> str:
+    return "; ".join(f"{row.servo}: {row.clause}" for row in wrong)
 
 
 def _require_whole(store: Store, config: Path, seconds: float) -> None:

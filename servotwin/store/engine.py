@@ -73,6 +73,13 @@ class StoreDamaged(StoreUnavailable):
 class ServoSetAside(StoreUnavailable):
     """Rows of the servo are damaged: it is set aside, and the store works for all others. One sentence."""
 
+    def __init__(self, servo: str) -> None:
+        super().__init__(
+            f"the twin's record of servo {servo!r} is damaged and set aside: its edge keeps its windows until that is "
+            "put right"
+        )
+        self.servo = servo
+
 
 class StoreBusy(RuntimeError):
     """Too many messages wait to be committed, so that no more are accepted. One sentence."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-from servotwin.store.engine import StoreBusy, StoreUnavailable
+from servotwin.store.engine import ServoSetAside, StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, PutResult, WorkResult
 from servotwin.store.store import Store
 
@@ -56,7 +56,8 @@ class GroupCommit:
 
     A future is resolved when its transaction is on the disk. If the transaction fails, all its futures get
     StoreUnavailable, and the thread continues with the next writes. A write that is invalid by itself (a result that
-    covers a message of another lease) fails alone: the others are committed without it.
+    covers a message of another lease) fails alone, and so do those of a servo that is set aside: the others are
+    committed without them.
 
     Parameters
     ----------
@@ -157,6 +158,10 @@ class GroupCommit:
     def _write(self, jobs: Sequence[_Write]) -> None:
         try:
             self._commit(jobs)
+        except ServoSetAside as error:
+            _fail([job for job in jobs if job.record.servo == error.servo], error)
+            if others := [job for job in jobs if job.record.servo != error.servo]:
+                self._write(others)
         except StoreUnavailable as error:
             _fail(jobs, error)
         except Exception as error:
@@ -234,6 +239,8 @@ class AwaitedCommits:
         self._begun[mark] = self._clock()
         try:
             result = await self._wrap(write(record))
+        except ServoSetAside:
+            raise  # the store itself works
         except StoreUnavailable as error:
             self._failed[type(record)] = _Failure(self._clock(), str(error))
             raise

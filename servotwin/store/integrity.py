@@ -31,7 +31,9 @@ from servotwin.store.stored_value import WrongRow, wrong_row_of, wrong_rows
 log = logging.getLogger(__name__)
 
 _OWN_TABLES = ("sqlite_sequence", VERSIONS)
-_TABLES = (*_OWN_TABLES, "twins", "claims", "states", "contexts", "outgoing", "evidence", "messages", "bodies")
+_TABLES = (
+    *_OWN_TABLES, "set_aside", "twins", "claims", "states", "contexts", "outgoing", "evidence", "messages", "bodies",
+)  # fmt: skip
 """By size, the smallest first: in a bounded time as many as possible are checked. The first two are SQLite's, which
 counts ids there, and that of the migrations."""
 _STEPS = 20_000

@@ -7,7 +7,7 @@ import sqlalchemy as sa
 from servotwin.store.records import MessageKind
 from servotwin.store.stored_value import OWNER, TIME, Content, check_values
 
-REVISION = "0004"
+REVISION = "0005"
 """Newest migration, which makes the tables below."""
 
 metadata = sa.MetaData(
@@ -120,6 +120,16 @@ claims = sa.Table(
     sa.Column("run", sa.Text, nullable=False),
     sa.Column("number", sa.BigInteger, nullable=False),
     sa.Column("created", sa.Double, nullable=False),
+)
+
+# Not tied to `twins` either: whoever puts a servo's record right may delete all of it. `message`: 0, or that whose body
+# is damaged.
+set_aside = sa.Table(
+    "set_aside",
+    metadata,
+    sa.Column("servo", sa.Text, primary_key=True),
+    sa.Column("clause", sa.Text, nullable=False),
+    sa.Column("message", sa.BigInteger, nullable=False),
 )
 
 # Literals, not parameters: a planner uses a partial index only where a query repeats its condition word for word.

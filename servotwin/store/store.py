@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 import sqlalchemy as sa
@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from servotwin.errors import InvalidInput
 from servotwin.store import incoming, leases, queries, results
 from servotwin.store import outgoing as posting
+from servotwin.store import set_aside as aside_rows
 from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
     Engines,
@@ -67,8 +68,9 @@ class Store:
     damaged : bool
         Set it where the database is found damaged: from then on everything that writes raises StoreUnavailable.
     aside : mapping of str to WrongRow
-        Replace it where nothing is damaged but rows of these servos: from then on they have no turn, nothing of them is
-        written, methods that name one raise ServoSetAside, and those that are of all leave them out.
+        Servos that are set aside, each with a wrong row, as the database had them when this store last wrote: they have
+        no turn, nothing of them is written, methods that name one raise ServoSetAside, and those that are of all leave
+        them out. Each transaction that writes reads them first, since another process may set a servo aside.
     """
 
     def __init__(self, engines: Engines) -> None:
@@ -93,10 +95,22 @@ class Store:
         """Raise ServoSetAside where one of these is set aside."""
         for servo in servos if self.aside else ():
             if servo in self.aside:
-                raise ServoSetAside(
-                    f"the twin's record of servo {servo!r} is damaged and set aside: its edge keeps its windows until "
-                    "that is put right"
-                )
+                raise ServoSetAside(servo)
+
+    def learn_aside(self) -> None:
+        """Read which servos are set aside; raises StoreUnavailable."""
+        self.aside = self._read(aside_rows.noted)
+
+    def set_aside(self, wrong: Collection[WrongRow]) -> None:
+        """Set servos aside for all processes, by a wrong row of each; raises StoreUnavailable."""
+        with transaction(self.engines.writer) as connection:  # of a damaged store nothing else is written
+            aside_rows.note(connection, wrong)
+            self.aside = aside_rows.noted(connection)
+
+    def take_back(self, wrong: WrongRow) -> None:
+        """End that a servo is set aside, unless for another row meanwhile; raises StoreUnavailable."""
+        self._write(lambda connection: aside_rows.strike(connection, wrong))
+        self.learn_aside()
 
     def put(self, items: Sequence[Incoming]) -> list[PutResult]:
         """Store messages in one transaction; returns the result of each.
@@ -120,8 +134,8 @@ class Store:
         self, items: Sequence[Incoming], work: Sequence[WorkResult], now: float
     ) -> tuple[list[PutResult], list[bool]]:
         """`put` and `commit` in one transaction."""
-        self.require_sound(*(item.servo for item in items), *(result.servo for result in work))
-        return self._write(lambda c: (incoming.put(c, items), results.commit(c, work, now)))
+        servos = {item.servo for item in items} | {result.servo for result in work}
+        return self._write(lambda c: (incoming.put(c, items), results.commit(c, work, now)), *servos)
 
     def lease(
         self,
@@ -175,8 +189,7 @@ class Store:
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
-        some = None if servos is None else self.sound(servos)
-        self._write(lambda connection: leases.release(connection, owner, some, self.aside))
+        self._write(lambda c: leases.release(c, owner, None if servos is None else self.sound(servos), self.aside))
 
     def renew(self, owner: str, servos: Collection[str], until: float) -> None:
         """Extend an owner's leases of some servos until a time, s since the epoch; those that it has lost stay lost."""
@@ -184,23 +197,19 @@ class Store:
 
     def hold(self, servo: str, until: float) -> None:
         """Let nobody lease a servo until a time, s since the epoch; does nothing where somebody has it."""
-        self.require_sound(servo)
-        self._write(lambda connection: leases.hold(connection, servo, until))
+        self._write(lambda connection: leases.hold(connection, servo, until), servo)
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first."""
-        self.require_sound(servo)
-        return self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
+        return self._read(lambda connection: posting.after_serial(connection, servo, after, limit), servo)
 
     def post(self, sent: Mapping[str, bytes], now: float, above: int = 0) -> None:
         """Post a message to each of these edges, its serial above `above`; unknown servos are left out."""
-        self.require_sound(*sent)
-        self._write(lambda connection: posting.post(connection, sent, now, above))
+        self._write(lambda connection: posting.post(connection, sent, now, above), *sent)
 
     def skip_to_serial(self, servo: str, serial: int) -> None:
         """Make the serial of the next message to the edge exceed `serial`."""
-        self.require_sound(servo)
-        self._write(lambda connection: posting.skip_to_serial(connection, servo, serial))
+        self._write(lambda connection: posting.skip_to_serial(connection, servo, serial), servo)
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
@@ -208,18 +217,15 @@ class Store:
 
     def claim_of(self, servo: str) -> StoredClaim:
         """Newest claim of a servo's edge."""
-        self.require_sound(servo)
-        return self._read(lambda connection: claim_of(connection, servo))
+        return self._read(lambda connection: claim_of(connection, servo), servo)
 
     def raise_claim(self, servo: str, new: StoredClaim, below: int, now: float) -> StoredClaim:
         """Store a claim where the servo's newest has a number below `below`; return the one that counts then."""
-        self.require_sound(servo)
-        return self._write(lambda connection: raise_claim(connection, servo, new, below, now))
+        return self._write(lambda connection: raise_claim(connection, servo, new, below, now), servo)
 
     def add_alarm(self, sentence: str, now: float, *servos: str) -> None:
         """Store an alarm about each of some servos, which belongs to no window."""
-        self.require_sound(*servos)
-        self._write(lambda connection: add_alarm(connection, servos, sentence, now))
+        self._write(lambda connection: add_alarm(connection, servos, sentence, now), *servos)
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""
@@ -235,8 +241,7 @@ class Store:
 
     def servo(self, name: str) -> ServoSummary | None:
         """Summary of one servo; None: it is unknown."""
-        self.require_sound(name)
-        return self._read(lambda connection: queries.servo(connection, name))
+        return self._read(lambda connection: queries.servo(connection, name), name)
 
     def fleet(self, name: str) -> str:
         """Name of the fleet whose servos the store holds: the first one that was ever given."""
@@ -248,8 +253,7 @@ class Store:
 
     def window(self, servo: str, boot: str, sequence: int) -> StoredMessage | None:
         """A window with its body, which is empty once retention deleted it; None: it is unknown."""
-        self.require_sound(servo)
-        return self._read(lambda connection: queries.window(connection, servo, boot, sequence))
+        return self._read(lambda connection: queries.window(connection, servo, boot, sequence), servo)
 
     def audit(
         self,
@@ -275,8 +279,7 @@ class Store:
         updates : bool
             Only windows that led to an update.
         """
-        self.require_sound(servo)
-        return self._read(lambda connection: queries.audit(connection, servo, since, limit, window, before, updates))
+        return self._read(lambda c: queries.audit(c, servo, since, limit, window, before, updates), servo)
 
     def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[StoredEvidence]:
         """Evidence that belongs to no window, newest first: starts of the edge, fallbacks, answers, faults of the twin.
@@ -286,13 +289,11 @@ class Store:
         since : float
             s since the epoch: only evidence from then or later.
         """
-        self.require_sound(servo)
-        return self._read(lambda connection: queries.events(connection, servo, since, limit))
+        return self._read(lambda connection: queries.events(connection, servo, since, limit), servo)
 
     def windows(self, servo: str, limit: int = 100, before: int | None = None) -> list[StoredWindow]:
         """Windows without bodies, newest first."""
-        self.require_sound(servo)
-        return self._read(lambda connection: queries.windows(connection, servo, limit, before))
+        return self._read(lambda connection: queries.windows(connection, servo, limit, before), servo)
 
     def contexts(self, keys: Collection[str]) -> dict[str, str]:
         """JSON texts of contexts by key; unknown keys are left out."""
@@ -300,8 +301,7 @@ class Store:
 
     def reading(self, action: Callable[[sa.Connection], _Result], *servos: str) -> _Result:
         """Run a query, such as those of `overview`, of all servos or these alone; raises StoreUnavailable."""
-        self.require_sound(*servos)
-        return self._read(action)
+        return self._read(action, *servos)
 
     def write_nothing(self) -> None:
         """Commit a row as it is; raises StoreUnavailable where the database cannot be written.
@@ -317,17 +317,25 @@ class Store:
         if self.damaged:
             raise StoreUnavailable(f"store {self.name}: is damaged and not written any more")
         with transaction(self.engines.writer) as connection:
+            self.aside = aside_rows.noted(connection)
             yield connection
 
-    def _read(self, action: Callable[[sa.Connection], _Result]) -> _Result:
+    def _read(self, action: Callable[[sa.Connection], _Result], *servos: str) -> _Result:
+        self.require_sound(*servos)
         with transaction(self.engines.reader) as connection:
             return action(connection)
 
-    def _write(self, action: Callable[[sa.Connection], _Result]) -> _Result:
-        """Run the action in a transaction; retry it where it only lost a race with another process."""
+    def _write(self, action: Callable[[sa.Connection], _Result], *servos: str) -> _Result:
+        """Run the action, on these servos, in a transaction; retry it where it only lost a race with another process.
+
+        Raises
+        ------
+        ServoSetAside, StoreUnavailable
+        """
         for _ in range(_RACES):
             try:
                 with self.writing() as connection:
+                    self.require_sound(*servos)
                     return action(connection)
             except StoreUnavailable as error:
                 if not lost_race(error):
@@ -362,4 +370,7 @@ def open_store(url: str, password: str | None = None) -> Store:
     except BaseException:
         engines.dispose()
         raise
-    return Store(engines)
+    store = Store(engines)
+    with suppress(StoreUnavailable):  # whoever writes reads it again, and checks tell what is wrong
+        store.learn_aside()
+    return store

@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import ServoSetAside, StoreUnavailable
 from servotwin.store.leases import LONGEST_HOLD_S
 from servotwin.store.records import Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
@@ -339,6 +339,8 @@ class Dispatcher:
             valid = await self._commit(result)
         except StoreUnavailable as error:
             counts.add("not committed")
+            if isinstance(error, ServoSetAside):  # others go on, and its lease ends by itself
+                return False
             self._not_committed = True
             self._uncommitted.failed(self._clocks.monotonic(), servo=result.servo, why=str(error))
             self._to_release.add(result.servo)

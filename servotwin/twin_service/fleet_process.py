@@ -23,7 +23,6 @@ from servotwin.runtime.frames import frame, read_frame
 from servotwin.store.engine import StoreUnavailable, engines_of, parse_address
 from servotwin.store.overview import StorePosition
 from servotwin.store.store import Store
-from servotwin.store.stored_value import WrongRow
 from servotwin.twin_service.fleet_reader import FleetReader
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import StoreAddress, WorkerLost, WorkerProcess
@@ -49,8 +48,6 @@ class ChangesQuestion(NamedTuple):
         All others are not.
     part, most : int
         Rows of one part, and of all.
-    aside : tuple of str
-        Servos that are set aside.
     """
 
     since: StorePosition
@@ -59,7 +56,6 @@ class ChangesQuestion(NamedTuple):
     sole: bool = False
     part: int = 1000
     most: int = 8000
-    aside: tuple[str, ...] = ()
 
 
 class FleetChanges(NamedTuple):
@@ -131,8 +127,7 @@ class ChangeReader:
         if self._process is not None:
             try:
                 async with self._turn:
-                    asked = question._replace(aside=tuple(self._reader.aside))
-                    found = _changes(await self._process.ask(_encode(asked)))
+                    found = _changes(await self._process.ask(_encode(question)))
             except WorkerLost as lost:
                 log.warning("the process that reads changes was lost", extra={"why": str(lost)})
                 await self.stop()
@@ -191,10 +186,10 @@ def main(descriptor: int) -> None:
 
 
 def _answer(store: Store, question: ChangesQuestion) -> FleetChanges:
-    store.aside = {servo: WrongRow(servo, "") for servo in question.aside}
     connected, absent = frozenset(question.connected), False if question.sole else None
     reader = FleetReader(store, lambda servo: True if servo in connected else absent, time.time)
     try:
+        store.learn_aside()
         return read_changes(reader, question)
     except StoreUnavailable as error:
         return FleetChanges(question.since, fault=str(error))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -12,7 +12,6 @@ from servotwin.dashboard.fleet import ALARMS_S, FleetRow, context_key, fleet_row
 from servotwin.store import overview, queries
 from servotwin.store.overview import StorePosition
 from servotwin.store.store import Store
-from servotwin.store.stored_value import WrongRow
 
 _CONTEXTS = 1000
 """Texts of contexts in memory."""
@@ -83,11 +82,6 @@ class FleetReader:
     def __init__(self, store: Store, presence: Callable[[str], bool | None], wall: Callable[[], float]) -> None:
         self._store, self._presence, self._wall = store, presence, wall
         self._contexts: dict[str, str] = {}
-
-    @property
-    def aside(self) -> Mapping[str, WrongRow]:
-        """Servos that are set aside, whose rows are left out."""
-        return self._store.aside
 
     def page(self, after: str, limit: int) -> FleetPage:
         """Rows of the servos whose names follow `after`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from math import inf
@@ -106,6 +106,7 @@ class StoreWatch:
         self.fault, self.lost, self.rounds = "", "", 0
         self._newer = ""
         self._read_wrong, self._again = False, 0
+        self._logged_aside: Mapping[str, WrongRow] = {}
 
     @property
     def aside(self) -> dict[str, str]:
@@ -143,6 +144,7 @@ class StoreWatch:
 
     async def start(self) -> None:
         """Check the pages for a short time, and if messages are missing that the store once had."""
+        self._log_aside()
         with suppress(StoreUnavailable):
             self._found(await self._executor.run(partial(check_pages, self._store, _START_S), slow=True))
             if not self.fault:
@@ -166,6 +168,7 @@ class StoreWatch:
         pause = _RECHECK_S
         while True:
             await asyncio.sleep(_TELL_S)
+            self._log_aside()
             if self._executor.damage is not None:
                 self._was_read(self._executor.damage)
             begun = self._monotonic()
@@ -221,20 +224,26 @@ class StoreWatch:
     def _resume(self, wrong: Sequence[WrongRow] = ()) -> None:
         """Write the store again but for the servos of wrong rows, over connections that have read nothing damaged."""
         self._store.engines.dispose()
-        before, aside = self._store.aside, {str(row.servo): row for row in wrong}
-        self._store.aside = aside  # first: from here on nobody reads or writes those rows
+        self._store.set_aside(wrong)  # first: from here on nobody reads or writes those rows
         self.fault, self._executor.damage, self._store.damaged, self._read_wrong = "", None, False, False
-        for servo in aside.keys() - before.keys():
-            log.error("servo set aside", extra={"servo": servo, "why": aside[servo].clause})
+        self._log_aside()
         log.warning("store sound again: it is written", extra={"after": self._why})
         self._compare_mark()
 
     def _look_aside(self) -> None:
         """Take back those servos whose rows are sound now."""
-        for servo, wrong in self._store.aside.items():
+        for wrong in self._store.aside.values():
             if not fault_of_servo(self._store, wrong):
-                self._store.aside = {name: row for name, row in self._store.aside.items() if name != servo}
-                log.warning("servo sound again", extra={"servo": servo, "after": wrong.clause})
+                self._store.take_back(wrong)
+        self._log_aside()
+
+    def _log_aside(self) -> None:
+        """Log servos that were set aside or taken back since the last call, by this twin or another one."""
+        before, self._logged_aside = self._logged_aside, self._store.aside
+        for servo in sorted(self._logged_aside.keys() - before.keys()):
+            log.error("servo set aside", extra={"servo": servo, "why": self._logged_aside[servo].clause})
+        for servo in sorted(before.keys() - self._logged_aside.keys()):
+            log.warning("servo sound again", extra={"servo": servo, "after": before[servo].clause})
 
     async def run_mark(self) -> None:
         """Note the newest message beside the store every few seconds, and look at the store's schema."""

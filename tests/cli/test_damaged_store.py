@@ -16,6 +16,7 @@ from servotwin.store import engine
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import EvidenceRecord
 from servotwin.store.store import open_store
+from servotwin.store.stored_value import WrongRow
 
 COMMANDS = ["twin check", "servos", "audit ax-1", "replay ax-1", "backup b.db"]
 
@@ -276,3 +277,17 @@ def test_a_backup_of_a_store_that_has_lost_messages_says_so_and_replaces_none(tm
     assert (result.exit_code, result.stdout) == (INVALID, "")
     assert result.stderr == f"error: backup {copy}: is not replaced, because the store {lost}; give another file\n"
     assert (copy.stat().st_ino, copy.stat().st_mtime_ns) == (written.st_ino, written.st_mtime_ns)
+
+
+@pytest.mark.parametrize("command", [["servos"], ["audit", "ax-2"]])
+def test_a_servo_that_is_set_aside_is_left_out_and_it_is_said(tmp_path: Path, command: list[str]) -> None:
+    config = twin_file(tmp_path)
+    with closing(open_store(str(tmp_path / "twin.db"))) as store:
+        store.put([window("ax-1"), window("ax-2")])
+        store.set_aside([WrongRow("ax-1", "message 1: its body differs", 1)])
+    result = CliRunner().invoke(app, [*command, "--config", str(config)])
+    assert result.exit_code == INVALID
+    assert "ax-2" in result.stdout
+    assert "ax-1" not in result.stdout
+    assert "left out (ax-1: message 1: its body differs): put their rows right or delete them" in result.stderr
+    assert result.stderr.count("\n") == 1

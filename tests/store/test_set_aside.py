@@ -10,7 +10,7 @@ from store_cases import claim, letter, outcome, verification, window
 from servotwin.store import overview
 from servotwin.store.claims import StoredClaim
 from servotwin.store.clock_gaps import newest_receipt, old_messages
-from servotwin.store.engine import ServoSetAside, StoreUnavailable
+from servotwin.store.engine import ServoSetAside, StoreDamaged, StoreUnavailable
 from servotwin.store.integrity import (
     check_all,
     check_bodies,
@@ -24,6 +24,7 @@ from servotwin.store.records import EvidenceRecord
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.schema import metadata
 from servotwin.store.store import Store, open_store
+from servotwin.store.stored_value import WrongRow
 
 pytest_plugins = ("store_fixtures",)
 
@@ -35,7 +36,7 @@ NUMBERS = ("twins.serial", "twins.ready", "twins.wake", "messages.received", "me
 OWN = sorted(
     f"{table.name}.{column.name}"
     for table in metadata.tables.values()
-    if table.name != "contexts"
+    if table.name not in ("contexts", "set_aside")
     for column in table.columns
     if not column.primary_key and not column.foreign_keys and column.name != "servo"
 )
@@ -119,7 +120,7 @@ def set_aside(store: Store, column: str) -> None:
     (wrong,) = report.rows
     assert wrong.servo == HIT
     assert column.split(".")[0] in wrong.clause or "its body differs" in wrong.clause
-    store.aside = {HIT: wrong}
+    store.set_aside(report.rows)
 
 
 @pytest.mark.parametrize("column", OWN)
@@ -143,7 +144,7 @@ def test_a_number_that_cannot_be_concerns_its_servo_alone_in_both_systems(store:
     assert column in fault_of_servo(store, store.aside[HIT])
     hit(store, column, "1")
     assert fault_of_servo(store, store.aside[HIT]) == ""
-    store.aside = {}
+    store.take_back(store.aside[HIT])
 
 
 def test_a_body_that_changed_concerns_its_servo_until_the_body_is_gone(store: Store) -> None:
@@ -158,7 +159,32 @@ def test_a_body_that_changed_concerns_its_servo_until_the_body_is_gone(store: St
     assert fault_of_servo(store, wrong) == ""
     hit(store, "bodies.body", changed)  # the next one of the same servo
     assert fault_of_servo(store, wrong)
-    store.aside = {}
+    store.take_back(store.aside[HIT])
+
+
+def test_a_wrong_value_in_the_note_itself_is_over_once_the_servo_is_noted_anew(store: Store) -> None:
+    hit(fill(store), "twins.serial", "-7")
+    set_aside(store, "twins.serial")
+    hit(store, "set_aside.message", "-7")
+    with pytest.raises(StoreDamaged, match=r"column set_aside\.message holds -7"):
+        store.put([digested("ax-1", 20)])
+    hit(store, "twins.serial", "0")
+    (wrong,) = check_all(store, math.inf).rows
+    store.set_aside([wrong])
+    assert store.put([digested("ax-1", 20)])
+    store.take_back(store.aside[HIT])
+    assert store.put([digested(HIT, 20)])
+
+
+def test_a_servo_is_taken_back_only_for_the_row_that_was_looked_at(store: Store) -> None:
+    """Another twin may have found another row meanwhile."""
+    fill(store).set_aside([WrongRow(HIT, "one")])
+    store.set_aside([WrongRow(HIT, "other", 3), WrongRow("ax-2", "its own")])
+    store.take_back(WrongRow(HIT, "one"))
+    assert store.aside == {HIT: WrongRow(HIT, "other", 3), "ax-2": WrongRow("ax-2", "its own")}
+    for wrong in list(store.aside.values()):
+        store.take_back(wrong)
+    assert store.aside == {}
 
 
 @pytest.mark.parametrize("hits", [("ax-1", "ax-2", "ax-3"), FLEET])
@@ -218,4 +244,4 @@ def test_nothing_is_written_or_read_under_the_name_of_a_servo_that_is_set_aside(
             call()
     assert store.window("ax-2", "boot", 60) is None
     assert issubclass(ServoSetAside, StoreUnavailable)
-    store.aside = {}
+    store.take_back(store.aside[HIT])

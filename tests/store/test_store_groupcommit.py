@@ -16,10 +16,11 @@ from sqlalchemy import event
 from store_cases import letter, outcome, window
 
 from servotwin.errors import InvalidInput
-from servotwin.store.engine import StoreBusy, StoreUnavailable, transaction
+from servotwin.store.engine import ServoSetAside, StoreBusy, StoreUnavailable, transaction
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import EvidenceRecord, Incoming, PutResult, WorkResult
 from servotwin.store.store import Store, open_store
+from servotwin.store.stored_value import WrongRow
 
 PATIENCE_S = 60.0
 FULL = "database or disk is full"
@@ -196,6 +197,40 @@ def test_an_invalid_result_fails_alone(store: Store, gate: Gate) -> None:
     assert isinstance(faulty.exception(PATIENCE_S), sa.exc.IntegrityError)
     assert (store.servo("a").serial, store.servo("b").serial) == (0, 1)
     group.close()
+
+
+def test_of_a_batch_only_the_messages_of_a_servo_that_is_set_aside_in_that_moment_are_refused(
+    store: Store, gate: Gate
+) -> None:
+    store.put([window("a"), window("b")])
+    a, b = sorted(store.lease("me", 2, 30.0, 200.0))
+    group = GroupCommit(gate)
+    futures = [group.put(letter("c"))]
+    assert gate.entered.wait(PATIENCE_S)
+    refused = [group.put(letter("a")), group.commit(outcome(a))]
+    futures += [group.put(letter("b")), group.put(letter("d"))]
+    valid = group.commit(outcome(b))
+    store.set_aside([WrongRow("a", "")])
+    gate.opened.set()
+    assert results(futures) == [PutResult.NEW] * 3
+    assert valid.result(PATIENCE_S) is True
+    for future in refused:
+        with pytest.raises(ServoSetAside, match="record of servo 'a' is damaged"):
+            future.result(PATIENCE_S)
+    assert gate.sizes == [1, 5, 3]
+    group.close()
+
+
+def test_a_message_of_a_servo_that_is_set_aside_says_nothing_about_the_store(store: Store, group: GroupCommit) -> None:
+    writes = AwaitedCommits(group)
+    store.set_aside([WrongRow("a", "")])
+
+    async def refused() -> None:
+        with pytest.raises(ServoSetAside):
+            await writes.put(window("a"))
+
+    asyncio.run(refused())
+    assert writes.failure == ""
 
 
 def limit_pages(store: Store, more: int | None) -> None:

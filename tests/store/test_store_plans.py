@@ -17,7 +17,7 @@ from servotwin.store.store import Store, open_store
 WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|verifications)")
 COUNTED = "count(*)"
 """What is not yet processed is counted, and is all that these indexes hold."""
-SMALL = re.compile(r"SCAN (chosen|anon_\d|\(subquery-\d+\)|\d+ CONSTANT ROWS?|CONSTANT ROW)")
+SMALL = re.compile(r"SCAN (chosen|set_aside|anon_\d|\(subquery-\d+\)|\d+ CONSTANT ROWS?|CONSTANT ROW)")
 """Results of a query's own parts, each of them limited."""
 AT_THE_END = "WHERE twins.lease_owner = ?"
 """What a service that ends gives back: once, over the servos."""

@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncIterator, Sequence
 
 from servotwin.messages import Setting, Update, encode
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import ServoSetAside, StoreUnavailable
 from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin_service import dispatcher as dispatching
 from servotwin.twin_service.dispatcher import Dispatcher
@@ -90,10 +90,13 @@ def through(
     pace: WorkPace | None = None,
     slow_commits: bool = False,
     quota: VerificationQuota | None = None,
+    aside: str = "",
 ) -> Lender:
     """All turns, one after the other; where `slow_commits`, with each job before the commit of the one before it."""
 
-    async def commit(_outcome: WorkResult) -> bool:
+    async def commit(made: WorkResult) -> bool:
+        if made.servo == aside:
+            raise ServoSetAside(aside)
         await asyncio.sleep(0.2 if slow_commits else 0.0)
         return valid
 
@@ -273,3 +276,10 @@ def test_a_dispatcher_knows_why_it_gets_no_work_and_when_the_store_is_back(monke
     through([[claim("ax-1")]])
     assert known[:3] == ["the disk is full", "the disk is full", "read-only"]
     assert resting_ones[-1].away == ""
+
+
+def test_a_result_of_a_servo_that_is_set_aside_stops_nobody_else(monkeypatch):
+    monkeypatch.setattr(dispatching, "_RETRY_S", 1e9)
+    lender = through([[claim("ax-1")], [claim("ax-2")], [claim("ax-1")]], aside="ax-1")
+    assert [servo for servo, _ in lender.noted] == ["ax-2"]
+    assert lender.released == []

@@ -1,18 +1,24 @@
 """A twin goes on without a servo of which rows are damaged, says so, and takes it back once they are right."""
 
 import asyncio
+import signal
 from collections.abc import Awaitable, Callable
+from contextlib import closing
 
+import httpx
 import pytest
 import sqlalchemy as sa
-from service_system import OPERATOR, OTHER, bearer, place, twin_file, window
+from service_system import OPERATOR, OTHER, TOKEN, bearer, place, process, twin_file, window
 from store_cases import SYSTEMS, postgresql_addresses
+from waiting import until as wait_until
 from watched_store import send, serve, until
 
 from servotwin.messages import encode
 from servotwin.store.engine import StoreDamaged
 from servotwin.store.schema import twins
+from servotwin.store.store import open_store
 from servotwin.twin_service import store_watch
+from servotwin.twin_service.twin_file import service_of
 
 pytest_plugins = ("store_fixtures",)
 
@@ -163,5 +169,64 @@ def test_rows_that_are_read_although_they_are_set_aside_stop_all(path):
     with_two(path, look)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_a_twin_that_ended_while_a_servo_was_set_aside_serves_all_others_at_once(path, end):
+    """As a process; the body of an old window is met by no check at the start."""
+    changed = "decode('00', 'hex')" if "postgresql" in path.read_text() else "x'00'"
+
+    def sent(url: str, one, token: str) -> int:
+        return httpx.put(url + place(one), content=encode(one), headers=bearer(token)).status_code
+
+    with process(path) as (twin, url):
+        assert [sent(url, window(n), TOKEN) for n in range(2)] == [201, 201]
+        assert sent(url, window(0, "ax-2"), OTHER) == 201
+        with closing(open_store(service_of(path).store)) as store, store.engines.writer.begin() as connection:
+            connection.exec_driver_sql(f"UPDATE bodies SET body = {changed} WHERE message = 2")
+        wait_until(lambda: httpx.get(f"{url}/healthz").json()["set_aside"])
+        twin.send_signal(end)
+        twin.wait(30.0)
+    with process(path) as (_, url):
+        assert sent(url, window(2), TOKEN) == 503
+        assert sent(url, window(1, "ax-2"), OTHER) == 201
+        health = httpx.get(f"{url}/healthz").json()
+        assert (list(health["set_aside"]), health["damage"]) == (["ax-1"], "")
+        with closing(open_store(service_of(path).store)) as store, store.engines.writer.begin() as connection:
+            connection.exec_driver_sql("DELETE FROM bodies WHERE message = 2")
+        wait_until(lambda: not httpx.get(f"{url}/healthz").json()["set_aside"])
+        assert sent(url, window(2), TOKEN) == 201
+
+
 def read_serials(connection):
     return connection.scalars(sa.select(twins.c.serial)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["UPDATE twins SET serial = -7 WHERE servo = 'ax-1'", "body"])
+def test_a_servo_that_is_set_aside_stays_so_over_a_restart_from_the_first_second(path, damage):
+    body = "decode('00', 'hex')" if "postgresql" in path.read_text() else "x'00'"
+    statement = f"UPDATE bodies SET body = {body} WHERE message = 2" if damage == "body" else damage
+
+    async def look(system, _client):
+        change(system, statement)
+        system.watch._check_some(0)
+        await until(lambda: system.watch.aside and not system.watch.fault)
+
+    async def again(system, client):
+        assert set(system.watch.aside) == {"ax-1"}
+        assert not system.watch.fault
+        assert await send(client, 2) == [503]
+        assert await of_other(client, 1) == 201
+        assert [lease.servo for lease in system.store.lease("me", 9, 10.0, system.clocks.wall())] == ["ax-2"]
+        change(system, "DELETE FROM bodies WHERE message = 2")
+        change(system, "UPDATE twins SET serial = 0 WHERE servo = 'ax-1'")
+        await until(lambda: not system.watch.aside)
+        assert await send(client, 2) == [201]
+
+    async def sound(system, client):
+        assert not system.watch.aside
+        assert await send(client, 3) == [201]
+
+    with_two(path, look)
+    serve(path, again)
+    serve(path, sound)
