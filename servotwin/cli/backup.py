@@ -9,7 +9,7 @@ from pathlib import Path
 from servotwin.cli.output import progress_bar
 from servotwin.errors import InvalidInput
 from servotwin.store.backup import Progress as Report
-from servotwin.store.backup import RowCounts, backup, newest_of, restore
+from servotwin.store.backup import RowCounts, backup, clauses, newest_of, restore
 from servotwin.twin_service.store_mark import lost_since
 from servotwin.twin_service.twin_file import service_of
 
@@ -20,7 +20,8 @@ def backup_store(config: Path, to: Path, replace: bool) -> None:
     Raises
     ------
     InvalidInput
-        As `store.backup.backup`; or the store has lost messages: the copy of it is made, but replaces no earlier one.
+        As `store.backup.backup`; or the store has lost messages, or servos are set aside: the copy of it is made, but
+        replaces no earlier one.
     """
     store = service_of(config).store
     lost = lost_since(store, newest_of(store, to))
@@ -29,8 +30,13 @@ def backup_store(config: Path, to: Path, replace: bool) -> None:
             f"backup {to}: is not replaced, because the store has lost messages ({lost}); give another file"
         )
     with _progress("copying") as report:
-        counts = backup(store, to, report, replace)
-    _print_counts(to, counts)
+        copied = backup(store, to, report, replace)
+    _print_counts(to, copied.rows)
+    if copied.left_out:
+        raise InvalidInput(
+            f"backup {to}: is written, but holds nothing of servos that are set aside ({clauses(copied.left_out)}); "
+            "keep the earlier ones, put the rows right, and back up again"
+        )
     if lost:
         raise InvalidInput(f"backup {to}: is written, but its store has lost messages ({lost}); keep the earlier ones")
 
@@ -39,8 +45,13 @@ def restore_store(config: Path, backed_up: Path) -> None:
     """Restore a backup to the store of a twin's file; raises InvalidInput as `store.backup.restore` does."""
     store = service_of(config).store
     with _progress("restoring") as report:
-        counts = restore(backed_up, store, report)
-    _print_counts(store, counts)
+        copied = restore(backed_up, store, report)
+    _print_counts(store, copied.rows)
+    if copied.left_out:
+        print(
+            f"missing: the backup holds nothing of {clauses(copied.left_out)}: these servos begin anew, and their "
+            "edges are asked for the windows that they keep; an earlier backup may hold them"
+        )
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_
 from servotwin.store.integrity import STORED_BODIES, body_fault
 from servotwin.store.migrate import VERSIONS, checked_revision
 from servotwin.store.outgoing import fresh_serial
-from servotwin.store.schema import REVISION, metadata
+from servotwin.store.schema import REVISION, metadata, set_aside
 from servotwin.store.stored_value import WrongValue, wrong_value
 
 PAGES = 2048
@@ -51,10 +51,25 @@ class RowCounts(NamedTuple):
     outgoing: int
 
 
-def backup(url: str, to: Path, progress: Progress | None = None, replace: bool = False) -> RowCounts:
+class CopiedStore(NamedTuple):
+    """Contents of a copy.
+
+    Attributes
+    ----------
+    rows : RowCounts
+    left_out : dict of str to str
+        Servos that are set aside, of which it holds nothing, each with a clause on the reason.
+    """
+
+    rows: RowCounts
+    left_out: dict[str, str]
+
+
+def backup(url: str, to: Path, progress: Progress | None = None, replace: bool = False) -> CopiedStore:
     """Copy a store as of one moment into a new file; writers continue meanwhile.
 
-    The copy is verified before it gets its name: it is complete or absent. Only its owner may read it.
+    The copy is verified before it gets its name: it is complete or absent, but for servos that are set aside, which it
+    names, so that `restore` can tell. Such a copy never replaces another one. Only its owner may read it.
 
     Parameters
     ----------
@@ -67,13 +82,13 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
 
     Returns
     -------
-    RowCounts
-        Rows in the file.
+    CopiedStore
 
     Raises
     ------
     InvalidInput
-        There is no store, it is damaged or in PostgreSQL, or the file exists or cannot be written.
+        There is no store, it is damaged or in PostgreSQL, or the file exists or cannot be written; or it exists, and
+        servos are set aside.
     """
     source = _existing(url, to)
     if to.exists() and to.samefile(source):
@@ -81,7 +96,18 @@ def backup(url: str, to: Path, progress: Progress | None = None, replace: bool =
     if to.exists() and not replace:
         raise InvalidInput(f"backup {to}: exists already; give another file, or --replace to replace it")
     with atomic_output(to, PRIVATE) as temporary:
-        return _copied(source, temporary, to, progress)
+        copied = _copied(source, temporary, to, progress)
+        if copied.left_out and to.exists():
+            raise InvalidInput(
+                f"backup {to}: is not replaced, because the new one would lack servos that are set aside "
+                f"({clauses(copied.left_out)}); give another file"
+            )
+        return copied
+
+
+def clauses(left_out: Mapping[str, str]) -> str:
+    """Servos that are set aside, and why."""
+    return "; ".join(f"{servo}: {why}" for servo, why in left_out.items())
 
 
 def newest_of(url: str, to: Path) -> int:
@@ -93,12 +119,13 @@ def newest_of(url: str, to: Path) -> int:
         return int(newest)
 
 
-def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowCounts:
+def restore(backed_up: Path, url: str, progress: Progress | None = None) -> CopiedStore:
     """Restore a backup to a store that does not exist or is empty.
 
     Messages posted since the backup are lost here but known to the edges, which ignore serials up to the last one that
     they received. So the serials continue far above those in the backup.
-    Every edge is asked for the windows that it still keeps: those since the backup are not in it.
+    Every edge is asked for the windows that it still keeps: those since the backup are not in it. Servos that the
+    backup leaves out begin anew, with an alarm.
 
     Raises
     ------
@@ -112,17 +139,20 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)
     with atomic_output(place, PRIVATE) as temporary:
-        counts = _copied(backed_up, temporary, place, progress)
+        copied = _copied(backed_up, temporary, place, progress)
         with _opened(temporary, "mode=rw", place) as store:
+            store.executemany("INSERT INTO twins (servo) VALUES (?)", [(servo,) for servo in copied.left_out])
             # Serials that edges received after the backup must not be used again.
             # Not by a margin alone: a second restore of one backup would use those of the first.
             serials = (_SERIAL_MARGIN + 1, fresh_serial(time.time()))
             store.execute("UPDATE twins SET posted = max(posted + ?, ?)", serials)
-            _ask_for_windows(store)
-        return counts
+            _ask_for_windows(store, copied.left_out)
+            if copied.left_out:
+                store.execute(f"DELETE FROM {set_aside.name}")
+        return copied
 
 
-def _ask_for_windows(store: sqlite3.Connection) -> None:
+def _ask_for_windows(store: sqlite3.Connection, left_out: Mapping[str, str]) -> None:
     """Ask every edge for the windows that it still keeps, and note the hole in the evidence of its servo."""
     reason, now = "the twin's store was restored from a backup", time.time()
     known = store.execute("SELECT servo, posted FROM twins").fetchall()
@@ -134,7 +164,8 @@ def _ask_for_windows(store: sqlite3.Connection) -> None:
         if last is None
         else datetime.fromtimestamp(last[0], UTC).strftime(" whose newest message came on %Y-%m-%d %H:%M:%S UTC")
     )
-    alarms = [alarm_row(servo, f"{reason}{backed_up}. {LOST_ANSWERS}", now) for servo, _ in known]
+    lacks = {servo: f", which lacks all of this servo ({why})" for servo, why in left_out.items()}
+    alarms = [alarm_row(servo, f"{reason}{backed_up}{lacks.get(servo, '')}. {LOST_ANSWERS}", now) for servo, _ in known]
     store.executemany(_ADD_ALARM, alarms)
 
 
@@ -157,8 +188,11 @@ def _source_file(url: str, command: str, file: Path) -> Path:
     raise InvalidInput(f"store {public_address(address)}: is in memory; give that of a file")
 
 
-def _copied(source: Path, target: Path, to: Path, progress: Progress | None) -> RowCounts:
-    """Copy the source as of one moment into the target, which will be named `to`; compare and check it."""
+def _copied(source: Path, target: Path, to: Path, progress: Progress | None) -> CopiedStore:
+    """Copy the source as of one moment into the target, which will be named `to`; compare and check it.
+
+    Without the rows of servos that are set aside: a twin would not read them.
+    """
     with _opened(target, "mode=rw", to) as copy:
         with _opened(source, "mode=ro") as original:
             # The first read fixes the snapshot: later writes go to the log.
@@ -169,19 +203,38 @@ def _copied(source: Path, target: Path, to: Path, progress: Progress | None) -> 
             original.execute("ROLLBACK")
         # Without a write-ahead log the copy is a single file.
         copy.execute("PRAGMA journal_mode = DELETE")
-        if fault := _fault_of(copy):
+        if fault := _fault_of_pages(copy):
             raise InvalidInput(f"store {source}: is damaged ({fault}); restore an earlier backup")
         # Compared as well as checked: a copy may be sound and yet lack rows.
         if _counts(copy) != expected:
             raise InvalidInput(f"store {source}: its copy does not hold the same rows; try again")
-        return expected
+        left_out = _leave_out(copy)
+        if fault := _fault_of_values(copy):
+            raise InvalidInput(f"store {source}: is damaged ({fault}); restore an earlier backup")
+        return CopiedStore(_counts(copy) if left_out else expected, left_out)
 
 
-def _fault_of(copy: sqlite3.Connection) -> str:
-    """First fault of a copy, its bodies compared with their digests: a twin would not write to it. Empty: none."""
+def _leave_out(copy: sqlite3.Connection) -> dict[str, str]:
+    """Delete all rows of servos that are set aside, but for the note of it; returns them, each with a clause."""
+    if set_aside.name not in _tables(copy):  # an earlier revision
+        return {}
+    left_out = {str(servo): str(why) for servo, why in copy.execute(f"SELECT servo, clause FROM {set_aside.name}")}
+    of_servo = [(servo,) for servo in left_out]
+    copy.executemany("DELETE FROM bodies WHERE message IN (SELECT id FROM messages WHERE servo = ?)", of_servo)
+    for table in reversed(metadata.sorted_tables):
+        if "servo" in table.columns and table is not set_aside:
+            copy.executemany(f"DELETE FROM {table.name} WHERE servo = ?", of_servo)
+    return dict(sorted(left_out.items()))
+
+
+def _fault_of_pages(copy: sqlite3.Connection) -> str:
+    """First fault of a copy's pages; empty: none."""
     (result,) = copy.execute("PRAGMA integrity_check(1)").fetchone()
-    if result != "ok":
-        return str(result).splitlines()[-1]  # the lines before tell the database, which is `main`
+    return "" if result == "ok" else str(result).splitlines()[-1]  # the lines before tell the database, which is `main`
+
+
+def _fault_of_values(copy: sqlite3.Connection) -> str:
+    """First wrong value or body of a copy, with which a twin would not write to it; empty: none."""
     for table in metadata.sorted_tables:
         if fault := wrong_value(copy, table):
             return fault
