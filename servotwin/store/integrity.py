@@ -56,6 +56,8 @@ for name in sys.argv[1:]:
 """
 _READ_S = 600.0
 _BODIES_AT_ONCE = 256
+_UNLIMITED_S = 20.0 * 86400.0
+"""s that no check takes. Not infinite: PostgreSQL's would then seek every row by each index, for four times as long."""
 
 
 class IntegrityReport(NamedTuple):
@@ -201,14 +203,12 @@ def check_bodies(store: Store, after: int, most: int, aside: Collection[str] = (
     return result, rows[-1].id if rows else after
 
 
-def check_all(store: Store, seconds: float, ended: Callable[[], bool] = lambda: False) -> IntegrityReport:
-    """Check files, pages and bodies of a store that was found damaged; `complete` where all was checked, and all of it
-    is sound, or all but `rows`.
+def check_all(store: Store, ended: Callable[[], bool] = lambda: False) -> IntegrityReport:
+    """Check files, pages and bodies of a store that was found damaged, however long it takes; `complete` where all was
+    checked, and all of it is sound, or all but `rows`.
 
     Parameters
     ----------
-    seconds : float
-        Time limit of the check of pages, s.
     ended : callable
         True: stop.
 
@@ -218,7 +218,7 @@ def check_all(store: Store, seconds: float, ended: Callable[[], bool] = lambda: 
         The store does not answer.
     """
     report = IntegrityReport()
-    for check in (partial(check_files, store), partial(check_pages, store, seconds, True, ended)):
+    for check in (partial(check_files, store), partial(check_pages, store, _UNLIMITED_S, True, ended)):
         report = check()
         if not report.complete or (report.faults and not report.rows):
             return report

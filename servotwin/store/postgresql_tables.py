@@ -99,8 +99,9 @@ def _lost_rows(connection: sa.Connection, until: float) -> tuple[str, ...]:
             _read_by_table(connection, by_table)
             _limit(connection, until)
             counts.append(connection.execute(_count(index)).scalar_one())
-        _limit(connection, until)
-        connection.execute(_seek(index, 100.0 if math.isinf(until) else _SOUGHT_PERCENT))
+        for seek in _seeks(index, 100.0 if math.isinf(until) else _SOUGHT_PERCENT):
+            _limit(connection, until)
+            connection.execute(seek)
         if counts[0] != counts[1]:
             faults.append(f"table {index.table.name}: {counts[0]} rows, and {counts[1]} in its index {index.name}")
     return tuple(faults)
@@ -129,18 +130,38 @@ def _count(index: _Index) -> sa.Select[Any]:
     return sa.select(sa.func.count()).select_from(rows.subquery())
 
 
-def _seek(index: _Index, percent: float) -> sa.Select[Any]:
+def _seeks(index: _Index, percent: float) -> Iterator[sa.Select[Any]]:
     """Seek a share of an index's rows from its root: to read it in its order visits the leftmost pages above leaves.
+
+    Rows with null in a column are sought apart: null compares with nothing, so that each would read all that are alike
+    in the columns before it, as all estimates of a servo.
+    """
+    yield _seek(index, percent, len(index.columns))
+    for place, column in enumerate(index.columns[:-1]):
+        if column.nullable:
+            yield _seek(index, percent, place)
+
+
+def _seek(index: _Index, percent: float, null: int) -> sa.Select[Any]:
+    """Seek rows with null in the column at the place `null`, or, where there is no such column, in none.
 
     Only this index gives its order, so that no plan can use another.
     """
     sample = index.table.tablesample(sa.func.bernoulli(percent), name="sample")
     sought = [sample.c[column.name] for column in index.columns]
-    from_there = sa.tuple_(*index.columns) >= sa.tuple_(*sought)
-    first: sa.Select[Any] = sa.select(sa.literal_column("1").label("found")).select_from(index.table).where(from_there)
+    if null == len(sought):
+        conditions = [sa.tuple_(*index.columns) >= sa.tuple_(*sought)]
+    else:
+        conditions = [column == value for column, value in zip(index.columns[:null], sought, strict=False)]
+        conditions += [
+            index.columns[null].is_(None),
+            sa.tuple_(*index.columns[null + 1 :]) >= sa.tuple_(*sought[null + 1 :]),
+        ]
+    first: sa.Select[Any] = sa.select(sa.literal_column("1").label("found")).select_from(index.table).where(*conditions)
     first = first if index.where is None else first.where(index.where)
     found = first.order_by(*index.columns).limit(1).correlate(sample).lateral()
-    return sa.select(sa.func.count()).select_from(sample.join(found, sa.true()))
+    kept = (value.is_(None) if place == null else value.is_not(None) for place, value in enumerate(sought))
+    return sa.select(sa.func.count()).select_from(sample.join(found, sa.true())).where(*kept)
 
 
 def _read_by_table(connection: sa.Connection, by_table: bool) -> None:

@@ -47,7 +47,8 @@ _START_S, _PAGES_S = 5.0, 60.0
 _BODIES, _SHARE = 32, 0.02
 """Bodies that are compared at once, and the share of the time for that."""
 _RECHECK_S, _LONGEST_RECHECK_S, _RECHECK_SHARE = 5.0, 600.0, 0.1
-"""s between two checks of a store that was found damaged: the first ones, and at most; and their share of the time."""
+"""s between two checks of a store that was found damaged: the first ones, and at most, unless a check takes longer; and
+their share of the time below that."""
 _MARK_S = 5.0
 """s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
 _TELL_S = 1.0
@@ -180,13 +181,15 @@ class StoreWatch:
                     await asyncio.sleep((self._monotonic() - begun) * (1.0 / _RECHECK_SHARE - 1.0))
                 continue
             with suppress(StoreUnavailable):
-                await self.recheck(max(pause, _PAGES_S))
+                await self.recheck()
             if self.fault:
-                await asyncio.sleep(max(pause, (self._monotonic() - begun) * (1.0 / _RECHECK_SHARE - 1.0)))
+                took = self._monotonic() - begun
+                longest = max(took, _LONGEST_RECHECK_S)
+                await asyncio.sleep(min(longest, max(pause, took * (1.0 / _RECHECK_SHARE - 1.0))))
                 pause = min(2.0 * pause, _LONGEST_RECHECK_S)
 
-    async def recheck(self, seconds: float) -> None:
-        """Check everything of a damaged store, its pages for that time at most, s; where it is sound, go on.
+    async def recheck(self) -> None:
+        """Check everything of a damaged store, however long it takes; where it is sound, go on.
 
         Go on without a few servos where nothing else is wrong.
 
@@ -203,12 +206,15 @@ class StoreWatch:
             if error:
                 self.fault = f"the disk does not give it: {error}"
                 return
-            report = await self._executor.run(partial(check_all, self._store, seconds, ended.is_set), slow=True)
+            report = await self._executor.run(partial(check_all, self._store, ended.is_set), slow=True)
             if report.faults and report.faults[0] != self.fault:  # who reads finds a column, and this its row too
                 self.fault, self._why = report.faults[0], "; ".join(report.faults)
                 log.error("damage of the store", extra={"why": self._why})
             if report.complete and (not report.faults or self._can_go_on(report.rows)):
                 await self._executor.run(partial(self._resume, report.rows))
+        except asyncio.CancelledError:
+            self._store.engines.opened.cut()  # a statement of PostgreSQL's knows nothing of the end
+            raise
         finally:
             ended.set()  # where this task was cancelled, its thread still checks
 

@@ -33,7 +33,7 @@ def hit(url: str) -> Store:
         store.commit([outcome(lease, seen, outgoing=(b"u",))], 201.0)
     with store.writing() as connection:
         connection.exec_driver_sql("UPDATE twins SET serial = -7 WHERE servo = 'ax-1'")
-    store.set_aside(check_all(store, 60.0).rows)
+    store.set_aside(check_all(store).rows)
     return store
 
 
@@ -45,7 +45,7 @@ def test_a_backup_holds_the_others_and_a_restore_says_whom_it_lacks(tmp_path: Pa
     assert restore(saved, again) == (RowCounts(1, 3, 3, 1, 1), {"ax-1": WRONG})
     with closing(open_store(again)) as restored:
         assert not restored.aside
-        assert not check_all(restored, 60.0).faults
+        assert not check_all(restored).faults
         assert restored.audit("ax-2") == before
         assert restored.audit("ax-1") == []
         for servo, said in (("ax-1", f", which lacks all of this servo ({WRONG}). Versions"), ("ax-2", " UTC. Ver")):

@@ -115,7 +115,7 @@ def use(store: Store, others: tuple[str, ...]) -> None:
 
 
 def set_aside(store: Store, column: str) -> None:
-    report = check_all(store, math.inf)
+    report = check_all(store)
     assert report.complete
     (wrong,) = report.rows
     assert wrong.servo == HIT
@@ -169,7 +169,7 @@ def test_a_wrong_value_in_the_note_itself_is_over_once_the_servo_is_noted_anew(s
     with pytest.raises(StoreDamaged, match=r"column set_aside\.message holds -7"):
         store.put([digested("ax-1", 20)])
     hit(store, "twins.serial", "0")
-    (wrong,) = check_all(store, math.inf).rows
+    (wrong,) = check_all(store).rows
     store.set_aside([wrong])
     assert store.put([digested("ax-1", 20)])
     store.take_back(store.aside[HIT])
@@ -194,10 +194,10 @@ def test_rows_of_many_servos_are_damage_of_the_store(store: Store, hits: tuple[s
     fill(store)
     for servo in hits[:2]:
         hit(store, column, value, servo)
-    assert {row.servo for row in check_all(store, math.inf).rows} == set(hits[:2])
+    assert {row.servo for row in check_all(store).rows} == set(hits[:2])
     for servo in hits[2:]:
         hit(store, column, value, servo)
-    report = check_all(store, math.inf)
+    report = check_all(store)
     assert report.rows == ()
     assert report.faults
     assert not report.complete
@@ -211,7 +211,7 @@ def test_a_wrong_key_is_damage_of_the_store(url: str, column: str) -> None:
             connection.exec_driver_sql("ROLLBACK")
             connection.exec_driver_sql("PRAGMA foreign_keys = OFF")
         hit(store, column, "-7" if column.endswith((".id", ".message", ".serial")) else "x'00'")
-        report = check_all(store, math.inf)
+        report = check_all(store)
         assert report.faults
         assert report.rows == ()
 
@@ -221,7 +221,7 @@ def test_a_context_and_a_page_are_damage_of_the_store(url: str) -> None:
         hit(store, "twins.gap", "'abc'")
         with store.engines.writer.begin() as connection:
             connection.exec_driver_sql("INSERT INTO contexts VALUES ('key', x'00')")
-        report = check_all(store, math.inf)
+        report = check_all(store)
         assert any("contexts.text" in fault for fault in report.faults)
         assert report.rows == ()
 

@@ -119,11 +119,11 @@ def test_a_disk_that_does_not_give_the_store_is_named_and_a_passing_error_ends(t
     async def body(system, client):
         system.watch._found(IntegrityReport(("database disk image is malformed",), False))
         for _ in range(2):
-            await system.watch.recheck(60.0)
+            await system.watch.recheck()
             assert (await client.get("/healthz")).json()["damage"] == (
                 "the disk does not give it: Input/output error, in twin.db"
             )
-        await system.watch.recheck(60.0)
+        await system.watch.recheck()
         assert await send(client, 0) == [201]
 
     monkeypatch.setattr(store_watch, "_TELL_S", 1e9)  # the service itself does not check
