@@ -287,6 +287,8 @@ def _postgresql(address: sa.URL, opened: OpenConnections) -> sa.Engine:
         opened.add(connection)
         # PostgreSQL itself waits for a lock for ever: VACUUM FULL, or a session that somebody forgot, would go unsaid.
         connection.execute(f"SET lock_timeout = {round(1000.0 * _BUSY_S)}")
+        # A twin that is stopped in a transaction keeps its locks: the server ends that before others give up waiting.
+        connection.execute(f"SET idle_in_transaction_session_timeout = {round(500.0 * _BUSY_S)}")
         connection.commit()
 
     return engine

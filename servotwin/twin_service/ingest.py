@@ -42,10 +42,21 @@ class Clocks(NamedTuple):
     def of_machine(cls) -> Clocks:
         """Clocks of the machine, unaffected by steps of its clock while the service runs.
 
-        Leases and wake-ups are on this clock: set back by an hour, it would delay them by that hour.
+        Leases and wake-ups are on this clock: set back by an hour, it would delay them by that hour. It goes on while
+        the machine sleeps: behind by an hour it would take the leases of all other twins for ended.
         """
-        zero = time.time() - time.monotonic()
-        return cls(lambda: zero + time.monotonic())
+        zero = time.time() - _elapsed()
+        return cls(lambda: zero + _elapsed())
+
+
+# On Linux CLOCK_MONOTONIC, which is time.monotonic, stands still while the machine sleeps; macOS has it the other way
+# round; Windows has neither number, and its time.monotonic goes on.
+_AWAKE_OR_NOT: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
+
+
+def _elapsed() -> float:
+    """Time since some moment (s), the machine's sleep included."""
+    return time.monotonic() if _AWAKE_OR_NOT is None else time.clock_gettime(_AWAKE_OR_NOT)
 
 
 async def _no_conflict(_servo: str, _boot: str, _sequence: int) -> None:
