@@ -60,6 +60,7 @@ _MAX_SERIAL = LARGEST_REPORTED
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _LOST = "the twin's store has lost messages"
 _ASIDE = "is set aside, and its edge keeps its windows, because its record is damaged"
+_REMEDY = "put that right as the operator's guide says (A servo is set aside)"
 
 
 class StoreWatch:
@@ -117,7 +118,7 @@ class StoreWatch:
     def sentences(self) -> list[str]:
         """Return a sentence for each servo that is set aside, and one where a newer servotwin migrated the store."""
         aside = self.aside.items()
-        return [*(f"servo {servo!r} {_ASIDE}: {why}" for servo, why in aside), *self._newer_sentences()]
+        return [*(f"servo {servo!r} {_ASIDE}: {why}; {_REMEDY}" for servo, why in aside), *self._newer_sentences()]
 
     def _newer_sentences(self) -> list[str]:
         if not self._newer:
@@ -233,7 +234,8 @@ class StoreWatch:
         self._store.set_aside(wrong)  # first: from here on nobody reads or writes those rows
         self.fault, self._executor.damage, self._store.damaged, self._read_wrong = "", None, False, False
         self._log_aside()
-        log.warning("store sound again: it is written", extra={"after": self._why})
+        done = "store written again, but for servos that are set aside" if wrong else "store sound again: it is written"
+        log.warning(done, extra={"after": self._why})
         self._compare_mark()
 
     def _look_aside(self) -> None:
@@ -277,7 +279,7 @@ class StoreWatch:
         told, damage, newer, aside = "", "", list[str](), frozenset[str]()
         while True:
             for servo in sorted(self.aside.keys() - aside):
-                announce("servo set aside", f"the servo {_ASIDE}: {self.aside[servo]}", servo)
+                announce("servo set aside", f"the servo {_ASIDE}: {self.aside[servo]}; {_REMEDY}", servo)
             aside = frozenset(self.aside)
             if self._newer_sentences() != newer:
                 newer = self._newer_sentences()

@@ -135,7 +135,9 @@ def _twin(snapshot: Snapshot) -> str:
 
 
 def _waits(twin: TwinStatus | None) -> str:
-    return "no answer" if twin is None else f"{twin.waiting} in its queue"
+    if twin is None:
+        return "no answer"
+    return f"{twin.waiting} in its queue" + "".join(f", [red]{escape(servo)} set aside[/]" for servo in twin.aside)
 
 
 def _windows(servo: ServoStatus) -> dict[str, Any]:

@@ -73,11 +73,14 @@ class TwinStatus(NamedTuple):
         s since the oldest of them was received.
     counts : dict of str to int
         Since its start, by the names in `_METRICS`, and "refused".
+    aside : tuple of str
+        Servos that are set aside, because their record is damaged.
     """
 
     waiting: int
     age: float
     counts: dict[str, int]
+    aside: tuple[str, ...] = ()
 
 
 class TwinPoller:
@@ -127,7 +130,8 @@ class TwinPoller:
             self._stop.wait(0.2)  # before the next attempt to connect
 
     def _poll(self, connection: HTTPConnection) -> TwinStatus:
-        waiting = msgspec.json.decode(self._get(connection, "/healthz"))["waiting"]
+        health = msgspec.json.decode(self._get(connection, "/healthz"))
+        waiting = health["waiting"]
         counts = read_metrics(self._get(connection, "/metrics").decode())
         for servo in self._servos:
             few = _WINDOWS if servo in self.estimates else _FIRST_WINDOWS
@@ -136,7 +140,7 @@ class TwinPoller:
                 newest = self._newest(connection, servo, min(_MOST_WINDOWS, waiting["messages"] + few))
             if newest is not None:
                 self.estimates[servo] = newest
-        return TwinStatus(waiting["messages"], waiting["age"], counts)
+        return TwinStatus(waiting["messages"], waiting["age"], counts, tuple(health.get("set_aside", ())))
 
     def _newest(self, connection: HTTPConnection, servo: str, limit: int) -> ServoEstimate | None:
         """Newest estimate among the last windows of a servo, at most `limit`."""

@@ -104,8 +104,10 @@ def test_a_wrong_value_of_one_servo_stops_that_servo_until_it_is_right_again(pat
         telling.cancel()
 
     with_two(path, look)
-    assert ("servo set aside", f"the servo {store_watch._ASIDE}: {BAD}", "ax-1") in said
+    assert ("servo set aside", f"the servo {store_watch._ASIDE}: {BAD}; {store_watch._REMEDY}", "ax-1") in said
     assert [line for line in caplog.messages if line.startswith("servo s")] == ["servo set aside", "servo sound again"]
+    assert "store written again, but for servos that are set aside" in caplog.messages
+    assert "store sound again: it is written" not in caplog.messages
 
 
 @pytest.mark.slow

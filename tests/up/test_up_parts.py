@@ -298,18 +298,18 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
         "windows": {"waiting": 3, "dropped": {"withheld": 2, "outbox full": 1}},
     }  # fmt: skip
     view = ServoStatus(SERVOS[2].plan, state, edge, EstimateError(newest, 9.0003, 58.0), 47, 4.2, 2)
-    shown = picture(view, TwinStatus(5, 0.1, {"windows": 121, "refused": 0}))
+    shown = picture(view, TwinStatus(5, 0.1, {"windows": 121, "refused": 0}, ("ax-1",)))
     text = text_of(shown)
     for expected in (
         "1:02:03", "9.131", "9.000 ± 0.040", "-0.0003 58 s ago", "7 fallback set", "0.0316", "Kp Ki Kd, V/mm",
-        "1.38 18.9 -0.135", "-50.0",
-        "outage, 4 s left", "11.9 x real time", "1.10 of 2 cores = 55 %", "121 windows", "5 in its queue",
+        "1.38 18.9 -0.135", "-50.0", "121 windows",
+        "outage, 4 s left", "11.9 x real time", "1.10 of 2 cores = 55 %", "5 in its queue, ax-1 set aside",
     ):  # fmt: skip
         assert expected in text, expected
     assert "…" not in text
     assert len(text.splitlines()) <= 24
     assert "version 7 fallback set, link cut, 3 wait" in display.line(shown)
-    assert display.line(shown).endswith("twin: 5 in its queue")
+    assert display.line(shown).endswith("twin: 5 in its queue, ax-1 set aside")
     assert "47 cut, 41 acknowledged, 3 waiting, 3 dropped" in next(iter(display.summary(shown)))
 
 
@@ -371,7 +371,7 @@ def test_a_machine_that_does_not_keep_its_speed_is_said(speed: float, reached: f
 def test_the_newest_estimate_is_looked_for_behind_the_windows_that_wait(
     monkeypatch: pytest.MonkeyPatch, waiting: int, limit: int, answer: bytes
 ) -> None:
-    health = b'{"waiting": {"messages": %d, "age": 0.0}}' % waiting
+    health = b'{"set_aside": {"b": ""}, "waiting": {"messages": %d, "age": 0.0}}' % waiting
     asked = []
 
     def get(_self: TwinPoller, _connection: object, path: str) -> bytes:
@@ -380,7 +380,7 @@ def test_the_newest_estimate_is_looked_for_behind_the_windows_that_wait(
 
     monkeypatch.setattr(TwinPoller, "_get", get)
     poller = TwinPoller("http://127.0.0.1:1", "token", ["a"])
-    assert poller._poll(None) is not None
+    assert poller._poll(None).aside == ("b",)
     wide = [] if limit == 20 else [f"/v1/servos/a/audit?limit={limit}"]
     assert asked[2:] == ["/v1/servos/a/audit?limit=20", *wide]
 
