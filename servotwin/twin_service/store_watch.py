@@ -234,8 +234,10 @@ class StoreWatch:
         self._store.set_aside(wrong)  # first: from here on nobody reads or writes those rows
         self.fault, self._executor.damage, self._store.damaged, self._read_wrong = "", None, False, False
         self._log_aside()
-        done = "store written again, but for servos that are set aside" if wrong else "store sound again: it is written"
-        log.warning(done, extra={"after": self._why})
+        if wrong:
+            log.warning("store written again, but for servos that are set aside", extra={"after": self._why})
+        else:
+            log.warning("store sound again: it is written", extra={"after": self._why})
         self._compare_mark()
 
     def _look_aside(self) -> None:
