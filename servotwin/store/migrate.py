@@ -37,8 +37,9 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
     """
     with transaction(engine) as connection:
         if connection.dialect.name == POSTGRESQL:
-            # Another process may migrate for minutes.
+            # Another process may migrate for minutes; and this one reads its scripts between two statements.
             connection.execute(sa.text("SET LOCAL lock_timeout = 0"))
+            connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
         # Read under the lock: another process may have migrated meanwhile.
         current = _revision(connection)
