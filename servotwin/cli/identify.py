@@ -16,9 +16,10 @@ from servotwin.cli.log_controller import controller_remarks
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.estimation.gap import default_method, is_motors_position, settings_of
+from servotwin.estimation.gap import default_method, settings_of
 from servotwin.estimation.late_window import samples_late
 from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.motors_position import is_motors_position
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.estimation.window import Window

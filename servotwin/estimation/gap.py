@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side, output_error, paper, whitened
 from servotwin.estimation.axis_model import has_servo, servo_of
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, no_estimate
 from servotwin.estimation.late_window import prompt_window
+from servotwin.estimation.motors_position import is_motors_position
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
@@ -45,6 +46,10 @@ METHODS: Mapping[str, Method] = {
 }
 """The methods for a servo, those of a twin."""
 
+_MOTORS_OWN = (
+    "axis sensors feedback = \"motor\": position follows the motor's angle as the motor's own does, and as the load's "
+    'without a gap would; give the load\'s position, and if this is it, state feedback = "load"'
+)
 ALLOWED, ROUNDED = 0.6, 0.5  # of a count: largest spread of a coarse encoder that is accepted, its own error
 _ALL = {
     **METHODS,
@@ -96,8 +101,10 @@ def estimate_gap(
     chosen, known = settings_of(method, settings), _usable_prior(prior)
     if isinstance(servo, Axis) and method != motor_side.METHOD:
         _check_position(window, servo)
-    if isinstance(servo, Servo) or method in (output_error.METHOD, motor_side.METHOD):
+    if isinstance(servo, Servo) or method == motor_side.METHOD:
         return _ALL[method].estimate(window, servo, known, chosen)
+    if method == output_error.METHOD:
+        return _loads_own(output_error.estimate(window, servo, known, chosen), servo)
     chosen = options_for(servo, method, settings)
     estimate: GapEstimate = _ALL[method].estimate(window, servo_of(servo), known, chosen)
     return replace(estimate, model_version=servo.version)
@@ -118,9 +125,21 @@ def default_method(servo: Plant) -> str:
 
 def _method_for(window: Window, servo: Plant) -> str:
     """The default method for a window: without the load's position the one that reads the motor."""
-    if window.has_position and not (isinstance(servo, Axis) and is_motors_position(window, servo)):
+    if not window.has_position:
+        return motor_side.METHOD
+    if not is_motors_position(window, servo):
         return default_method(servo)
+    if servo.rigid:
+        raise InvalidInput(f"{window.where}{_MOTORS_OWN}; behind a rigid transmission the motor shows no gap")
     return motor_side.METHOD
+
+
+def _loads_own(estimate: GapEstimate, axis: Plant) -> GapEstimate:
+    """The estimate; refused without a gap, where a position that the drive computed from the motor shows none."""
+    if not (axis.at_motor and axis.rigid and estimate.ok and estimate.interval[0] <= 0.0):
+        return estimate
+    blank = no_estimate(estimate.time, (_MOTORS_OWN,), estimate.model_version, estimate.method)
+    return replace(blank, rms=estimate.rms, evaluations=estimate.evaluations)
 
 
 def settings_of(method: str, settings: Any = None) -> Any:
@@ -153,11 +172,6 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
         largest_shift=max(settings.largest_shift, ROUNDED * count),
         model_error=max(settings.model_error, ROUNDED * count),
     )
-
-
-def is_motors_position(window: Window, axis: Axis) -> bool:
-    """True where a window's position is the motor's own, of an axis whose controller reads the motor's encoder."""
-    return axis.at_motor and window.follows_motor(axis.p, within=axis.p * axis.encoder_resolution)
 
 
 def _check_position(window: Window, axis: Axis) -> None:

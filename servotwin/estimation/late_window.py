@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from servotwin.estimation.commanded_angle import has_commanded_angle, samples_fading, with_commanded_angle
+from servotwin.estimation.motors_position import is_motors_position
 from servotwin.estimation.window import Window
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
@@ -37,7 +38,7 @@ def on_time(window: Window, plant: Plant) -> Window:
     delay.
     """
     motor, load = plant.sensors.motor.late(window.sample_rate), plant.sensors.load.late(window.sample_rate)
-    if plant.at_motor and window.follows_motor(plant.p, within=plant.p * plant.encoder_resolution):
+    if is_motors_position(window, plant):
         load = motor
     if motor == load == 0:
         return window

@@ -10,9 +10,10 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
-from servotwin.estimation.gap import ALLOWED, ROUNDED, is_motors_position
+from servotwin.estimation.gap import ALLOWED, ROUNDED
 from servotwin.estimation.joint.settings import JointSettings
 from servotwin.estimation.joint.verdict import JointEstimate, Parameter
+from servotwin.estimation.motors_position import is_motors_position
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import Actuator, DcMotor
 from servotwin.plant.axis import Axis
