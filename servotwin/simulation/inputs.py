@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
@@ -118,3 +119,14 @@ def whole_ratio(tick_rate: float, sample_rate: float) -> int | None:
     """The higher rate over the lower one, if that is a whole number."""
     ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
     return round(ratio) if abs(ratio - round(ratio)) <= 1e-9 * ratio else None
+
+
+def steps_of(tick_rate: float, sample_rate: float) -> tuple[int, int]:
+    """Base steps per tick and per sample; one of them is 1."""
+    whole = whole_ratio(tick_rate, sample_rate)
+    if whole is None:
+        raise InvalidInput(
+            f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: "
+            "one must be a whole multiple of the other"
+        )
+    return (1, whole) if tick_rate >= sample_rate else (whole, 1)

@@ -17,6 +17,8 @@ from servotwin.simulation.inputs import quantised
 TICKED_MOTOR = "theta_m at ticks"
 """Channel of the motor's true angle, tick by tick."""
 _BLOCK, _REMEMBERED = 4096, 4
+# Ticks of a chunk of noise: the first and the largest.
+_FIRST_CHUNK, _LARGEST_CHUNK = 1 << 13, 1 << 16
 
 
 @dataclass
@@ -73,92 +75,52 @@ class EncoderErrors:
 
 @dataclass
 class PositionErrors:
-    """A source of what the measured position is off by, step after step: a noise of its own, and that of the encoder.
+    """A source of what the measured position is off by, tick after tick: a noise of its own, and that of the encoder.
 
     Attributes
     ----------
     errors : EncoderErrors
+    every : int
+        Steps per tick.
     added : NoiseSource, optional
         Noise in place of the encoder's.
-    step : int
+    tick : int
         The next one.
     """
 
     errors: EncoderErrors
+    every: int
     added: NoiseSource | None
-    step: int = 0
+    tick: int = 0
 
     def block(self, n: int) -> Array:
-        """(n,) m, at the next steps."""
-        steps = np.arange(self.step, self.step + n)
-        self.step += n
+        """(n,) m, at the next ticks."""
+        steps = self.every * np.arange(self.tick, self.tick + n)
+        self.tick += n
         return np.zeros(n) + self.errors.at(steps) + (0.0 if self.added is None else self.added.block(n))
 
 
 @dataclass
 class NoiseBuffer:
-    """Noise for tick after tick, drawn at least `ahead` values at a time; the block size changes no value.
-
-    Attributes
-    ----------
-    source : NoiseSource or PositionErrors, optional
-        None: no noise.
-    ahead : int
-        Values.
-    every : int
-        Steps per tick. The source has a value for each step, and `at` repeats those of the ticks that were taken.
-    """
+    """Noise for tick after tick, drawn at least `ahead` values at a time; the block size changes no value."""
 
     source: NoiseSource | PositionErrors | None
     ahead: int
-    every: int = 1
     drawn: Array = field(default_factory=lambda: np.zeros(0))
-    _taken: Array = field(default_factory=lambda: np.zeros(0))
-    _first: int = 0
-    _end: int = 0
 
     def take(self, count: int) -> Array:
         """Noise (m) of the next ticks; one zero without noise."""
         if self.source is None:
             return np.zeros(1)
-        self._draw(count * self.every)
-        values, self.drawn = np.split(self.drawn, [count * self.every])
-        if self.every > 1:
-            self._remember(values)
-        return values[:: self.every]
-
-    def next(self) -> float:
-        """Noise (m) of the next tick, which stays the next one."""
-        if self.source is None:
-            return 0.0
-        self._draw(1)
-        return float(self.drawn[0])
-
-    def put_back(self, values: Array) -> None:
-        """Return noise that was taken for ticks that are still to come, of one step each."""
-        if self.source is not None:
-            self.drawn = np.concatenate([values, self.drawn])
-
-    def at(self, steps: NDArray[np.int64]) -> Array:
-        """Noise (m) at steps from the last one that was forgotten on."""
-        return np.zeros(steps.size) if self.source is None else self._taken[steps - self._first]
-
-    def forget(self, step: int) -> None:
-        """Drop what came before a step."""
-        if self.every > 1 and self.source is not None:
-            self._taken = self._taken[step - self._first : self._end - self._first]
-            self._first = step
-
-    def _draw(self, count: int) -> None:
-        assert self.source is not None
         if (missing := count - self.drawn.size) > 0:
             self.drawn = np.concatenate([self.drawn, self.source.block(max(missing, self.ahead))])
+        values, self.drawn = self.drawn[:count], self.drawn[count:]
+        return values
 
-    def _remember(self, values: Array) -> None:
-        used, self._end = self._end - self._first, self._end + values.size
-        if self._end - self._first > self._taken.size:
-            self._taken = np.concatenate([self._taken[:used], np.empty(used + values.size)])
-        self._taken[used : self._end - self._first] = values
+    def put_back(self, values: Array) -> None:
+        """Return noise that was taken for ticks that are still to come."""
+        if self.source is not None:
+            self.drawn = np.concatenate([values, self.drawn])
 
 
 @dataclass(frozen=True)
@@ -209,9 +171,10 @@ class Readings:
         """True where the motor's readings show its angle between two samples, at a tick of the law."""
         return self.motor.late % self.every != 0
 
-    def source(self, rate: float, rng: np.random.Generator) -> PositionErrors:
-        """Errors of the measured position at steps of a rate (Hz)."""
-        return PositionErrors(self.position, None if self.noise is None else self.noise.source(rate, rng))
+    def source(self, tick_rate: float, every: int, rng: np.random.Generator) -> PositionErrors:
+        """Errors of the measured position at ticks, which are `every` steps apart."""
+        added = None if self.noise is None else self.noise.source(tick_rate, rng)
+        return PositionErrors(self.position, every, added)
 
 
 def motor_readings(
@@ -231,3 +194,12 @@ def motor_readings(
     begin, end = int(steps[0]) // unit, int(steps[-1]) // unit
     angle = channel(name, begin, end + 1)[steps // unit - begin]
     return quantised(angle + readings.motor.at(steps), servo.encoder_resolution)
+
+
+def chunk_ends(base: int, end: int) -> list[int]:
+    """Base steps at which the chunks of a run in noise end."""
+    ends, chunk = list[int](), _FIRST_CHUNK
+    while base < end:
+        base, chunk = min(end, base + chunk), min(chunk + chunk // 2, _LARGEST_CHUNK)
+        ends.append(base)
+    return ends

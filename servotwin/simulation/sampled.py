@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.control import law
 from servotwin.control.controller import Controller
-from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import (
@@ -34,14 +32,15 @@ from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
 from servotwin.plant.sensors import Encoder
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation.between_ticks import BetweenTicks
 from servotwin.simulation.continuous import at_zero
-from servotwin.simulation.inputs import RunInputs, quantised, whole_ratio
-from servotwin.simulation.readings import TICKED_MOTOR, NoiseBuffer, PositionErrors, Readings
+from servotwin.simulation.inputs import RunInputs, quantised, steps_of
+from servotwin.simulation.readings import TICKED_MOTOR, NoiseBuffer, PositionErrors, Readings, chunk_ends
 from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Port, TickInputs, new_output, run_ticks, shifted_output, tick_and_record
 
 # Ticks of a chunk of noise, and chunks that are drawn before they are asked for.
-_FIRST_CHUNK, _CHUNK, _LARGEST_CHUNK, _DRAWN_AHEAD = 1 << 13, 1 << 15, 1 << 16, 3
+_CHUNK, _DRAWN_AHEAD = 1 << 15, 3
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -63,7 +62,7 @@ class SampledEngine:
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
-        self.tick_every, self.record_every = _divide(self.controller.sample_rate, self.inputs.sample_rate)
+        self.tick_every, self.record_every = steps_of(self.controller.sample_rate, self.inputs.sample_rate)
         self.rate = self.inputs.sample_rate * self.record_every
         constants = self.inputs.constants(self.servo)
         bias, friction = constants["input bias"] != 0.0, constants["friction"] != 0.0
@@ -79,8 +78,8 @@ class SampledEngine:
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
         self.law_state, self.parameters = self._started(start.command)
-        self.draws = NoiseBuffer(self._noise_source(), 0 if self.keep is None else _CHUNK, self.tick_every)
-        self.start_error = self._encoder_error()
+        self.draws = NoiseBuffer(self._noise_source(), ahead=0 if self.keep is None else _CHUNK)
+        self.between = self._between_ticks()
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         between = self.readings is not None and self.readings.between_samples
@@ -115,10 +114,16 @@ class SampledEngine:
         )
 
     def _noise_source(self) -> NoiseSource | PositionErrors | None:
-        """Source of what the measured position is off by at each step, of samples or of ticks."""
+        """Source of what the measured position is off by at each tick."""
         if self.readings is not None:
-            return self.readings.source(self.rate, self.rng)
-        return None if self.noise is None else self.noise.source(self.rate, self.rng)
+            return self.readings.source(self.tick_rate, self.tick_every, self.rng)
+        return None if self.noise is None else self.noise.source(self.tick_rate, self.rng)
+
+    def _between_ticks(self) -> BetweenTicks:
+        noise = None
+        if self.noise is not None and self.tick_every > 1:
+            noise = self.noise.source(self.rate, self.rng.spawn(1)[0])
+        return BetweenTicks(self._fed_back.late(self.rate), self.servo.position_resolution, self.readings, noise)
 
     @property
     def _fed_back(self) -> Encoder:
@@ -163,7 +168,7 @@ class SampledEngine:
         if self.keep is not None and index - self.oldest > 2 * self.keep:
             self.output = shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
             self.record.size[1] = 0
-            self.draws.forget(self.oldest)
+            self.between.forget(self.oldest)
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
         """Base steps during or at the end of which the gap's cubic changes, with those changes."""
@@ -217,7 +222,7 @@ class SampledEngine:
             return
         # The noise of the next chunks is drawn while this one runs. The first one, which is waited for, is short, and
         # they grow slowly, so that no later one is waited for.
-        ends = _chunk_ends(self.base, end)
+        ends = chunk_ends(self.base, end)
         chunks = deque(zip([self.base, *ends], ends, strict=False))
         with ThreadPoolExecutor(1) as pool:
             coming = deque(pool.submit(self._inputs_until, *chunks.popleft()) for _ in ends[:_DRAWN_AHEAD])
@@ -299,7 +304,7 @@ class SampledEngine:
             controller.law(planned if tolerance is None else tolerance),
             self.law_state,
             float(self.inputs.reference.value(time)),
-            self._shown(self.draws.next()),
+            self._shown(self._noise_ahead()),
         )
         self.controller, self.parameters = controller, controller.law(None)
 
@@ -325,19 +330,10 @@ class SampledEngine:
         out = self.output.measured[ticks - self.output.first_tick]
         between = since > 0
         if np.any(between):
-            out[between] = self._between_ticks(samples[between])
+            out[between] = self.between.read(samples[between], self._sensed)
         if last > self.index and not self.finished and not between[-1]:
             out[-1] = self._measured_now()
         return out
-
-    def _between_ticks(self, samples: NDArray[np.int64]) -> Array:
-        """Readings at samples between ticks, where a step is a sample."""
-        late = self._fed_back.late(self.rate)
-        steps = np.maximum(samples - late, 0)
-        errors = np.where(samples < late, self.start_error, self.draws.at(steps))
-        return quantised(
-            self._sensed(steps[0], steps[-1] + 1)[steps - steps[0]] + errors, self.servo.position_resolution
-        )
 
     def _sensed(self, first: int, last: int) -> Array:
         """What the position sensor sees at samples first .. last - 1, without errors and delay."""
@@ -352,6 +348,12 @@ class SampledEngine:
     def _encoder_error(self) -> float:
         """Error of the encoder of the position in the present state."""
         return 0.0 if self.readings is None else float(np.ravel(self.readings.position.at(np.array([self.base])))[0])
+
+    def _noise_ahead(self) -> float:
+        """Noise of the tick that is due, which takes it again."""
+        noise = self.draws.take(1)
+        self.draws.put_back(noise)
+        return float(noise[0])
 
     def _reading(self, noise: float = 0.0) -> float:
         """Reading of the position sensor in the present state."""
@@ -394,23 +396,3 @@ class SampledEngine:
         """Ticks per second."""
         assert self.controller.sample_rate is not None
         return self.controller.sample_rate
-
-
-def _chunk_ends(base: int, end: int) -> list[int]:
-    """Base steps at which the chunks of a run in noise end."""
-    ends, chunk = list[int](), _FIRST_CHUNK
-    while base < end:
-        base, chunk = min(end, base + chunk), min(chunk + chunk // 2, _LARGEST_CHUNK)
-        ends.append(base)
-    return ends
-
-
-def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
-    """Base steps per tick and per sample; one of them is 1."""
-    whole = whole_ratio(tick_rate, sample_rate)
-    if whole is None:
-        raise InvalidInput(
-            f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: "
-            "one must be a whole multiple of the other"
-        )
-    return (1, whole) if tick_rate >= sample_rate else (whole, 1)

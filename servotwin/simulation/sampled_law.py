@@ -86,7 +86,7 @@ class SampledLawEngine(SampledEngine):
         None."""
         time = -(-self.base // self.tick_every) / self.tick_rate
         planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
-        inputs = (float(self.inputs.reference.value(time)), self._motor_shown(), self._shown(self.draws.next()))
+        inputs = (float(self.inputs.reference.value(time)), self._motor_shown(), self._shown(self._noise_ahead()))
         tolerances = (planned, planned if tolerance is None else tolerance)
         self.law_state = controller.transfer(self.controller, self.law_state, inputs, tolerances)
         self.controller, self.parameters = controller, _with_arrays(controller.parameters())

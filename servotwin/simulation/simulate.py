@@ -70,8 +70,8 @@ class Simulation:
         Hz, of what is recorded. By default 5000 Hz, or the controller's own rate where the two do not divide one
         another.
     noise : Noise, optional
-        On the measured position, in place of that of its encoder, drawn for each sample, or each tick of the
-        controller where these are more; a continuous controller sees it constant between samples.
+        On the measured position, in place of that of its encoder; a continuous controller sees it constant between
+        samples. Samples between the ticks of a sampled controller have draws of their own.
     seed : int
         Seed of the noise.
     input_bias : float
@@ -144,7 +144,7 @@ class Simulation:
         if law.sample_rate is None:
             source: NoiseSource | PositionErrors | None = None
             if readings is not None:
-                source = readings.source(inputs.sample_rate, rng)
+                source = readings.source(inputs.sample_rate, 1, rng)
             elif noise is not None:
                 source = noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)
