@@ -18,9 +18,9 @@ _APART, _RATIO = 5, 0.01
 def is_motors_position(window: Window, plant: Plant) -> bool:
     """True where a window's position is the motor's own, of an axis whose controller reads the motor's encoder.
 
-    It may be late, held or smoothed by up to five samples, and rounded: it then lies between the least and the
-    greatest of the motor's angles about each sample. A load behind a gap does not, because it rests where it came to
-    rest. So a position that does is the motor's own, or the load's without a gap.
+    Behind a rigid transmission it may be late, held or smoothed by up to five samples, and rounded: it then lies
+    between the least and the greatest of the motor's angles about each sample. A load behind a gap does not, because it
+    rests where it came to rest. So a position that does is the motor's own, or the load's without a gap.
     """
     if not isinstance(plant, Axis) or not plant.at_motor or window.measured_position is None:
         return False
@@ -28,7 +28,7 @@ def is_motors_position(window: Window, plant: Plant) -> bool:
     if window.follows_motor(plant.p, within=rounded):
         return True
     angle, position = window.theta_m, window.measured_position
-    if angle is None or np.ptp(angle) == 0.0 or window.samples <= 2 * _APART:
+    if not plant.rigid or angle is None or np.ptp(angle) == 0.0 or window.samples <= 2 * _APART:
         return False
     # A late position has not quite the ratio of the least squares.
     centred = angle - angle.mean()

@@ -31,7 +31,7 @@ NOT_COUNTED = {
     "plumbing": ("runtime/retry.py",),
     "beside the way": (
         "edge/watch.py", "estimation/commanded_angle.py", "estimation/controller.py", "estimation/first_states.py",
-        "estimation/late_window.py",
+        "estimation/late_window.py", "estimation/motors_position.py",
         "twin/responses.py", "twin/lookups.py", "twin/requests.py",
         "twin/asking.py", "twin/in_force.py", "twin/untold_ratio.py",
     ),
