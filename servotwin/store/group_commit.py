@@ -159,8 +159,12 @@ class GroupCommit:
         try:
             self._commit(jobs)
         except ServoSetAside as error:
+            others = [job for job in jobs if job.record.servo != error.servo]
+            if len(others) == len(jobs):
+                _fail(jobs, error)
+                return
             _fail([job for job in jobs if job.record.servo == error.servo], error)
-            if others := [job for job in jobs if job.record.servo != error.servo]:
+            if others:
                 self._write(others)
         except StoreUnavailable as error:
             _fail(jobs, error)
