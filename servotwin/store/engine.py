@@ -20,12 +20,12 @@ import sqlalchemy as sa
 from sqlalchemy import event
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError, IntegrityError, ProgrammingError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
-from sqlalchemy.pool import QueuePool
 
 from servotwin.errors import InvalidInput, ResourceUnavailable
 from servotwin.runtime import sqlite_damage
 from servotwin.runtime.files import FilesInPlace
 from servotwin.runtime.sqlite_damage import damage_words
+from servotwin.store.pool import ClosingPool
 from servotwin.store.stored_value import WrongValue
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
@@ -275,7 +275,12 @@ def _postgresql(address: sa.URL, opened: OpenConnections) -> sa.Engine:
     times = {name: value for name, value in _SERVER_TIMES.items() if name not in address.query}
     try:
         engine = sa.create_engine(
-            address, hide_parameters=True, pool_size=_READERS, max_overflow=_READERS, connect_args=times
+            address,
+            hide_parameters=True,
+            poolclass=ClosingPool,
+            pool_size=_READERS,
+            max_overflow=_READERS,
+            connect_args=times,
         )
     except ModuleNotFoundError:
         raise InvalidInput(
@@ -299,7 +304,7 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
         address,
         hide_parameters=True,
         # No overflow: one writing connection is what serialises the writers of SQLite.
-        poolclass=QueuePool,
+        poolclass=ClosingPool,
         pool_size=connections,
         max_overflow=0,
         pool_timeout=_BUSY_S,

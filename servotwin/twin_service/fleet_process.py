@@ -69,14 +69,14 @@ class FleetChanges(NamedTuple):
         Lists of rows, JSON.
     many : bool
         More than the most changed: there are no parts.
-    fault : str
-        Why the store cannot be read; empty: it can.
+    failed : bool
+        The store could not be read.
     """
 
     position: StorePosition
     parts: tuple[bytes, ...] = ()
     many: bool = False
-    fault: str = ""
+    failed: bool = False
 
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -135,9 +135,9 @@ class ChangeReader:
                 await self.stop()  # its answer would be taken for that of the next question
                 raise
             else:
-                if found.fault:
-                    raise StoreUnavailable(found.fault)
-                return found
+                if not found.failed:
+                    return found
+                # Read here too: damage that only the other process has met would stop nothing.
         return await self._executor.run(partial(read_changes, self._reader, question))
 
     def start(self) -> None:
@@ -191,8 +191,8 @@ def _answer(store: Store, question: ChangesQuestion) -> FleetChanges:
     try:
         store.learn_aside()
         return read_changes(reader, question)
-    except StoreUnavailable as error:
-        return FleetChanges(question.since, fault=str(error))
+    except StoreUnavailable:
+        return FleetChanges(question.since, failed=True)
 
 
 if __name__ == "__main__":

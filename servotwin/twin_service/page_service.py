@@ -42,6 +42,8 @@ class PageService:
     clocks : Clocks
     shared : bool
         Other processes write to the same database.
+    executor : StoreExecutor
+        Notes damage that a reader meets.
 
     Attributes
     ----------
@@ -64,9 +66,10 @@ class PageService:
         claims: EdgeClaims,
         clocks: Clocks,
         shared: bool,
+        executor: StoreExecutor,
     ) -> None:
         self._config, self._store, self._monotonic = twin.service, store, clocks.monotonic
-        self.readers = StoreExecutor(_READERS, "readers")
+        self.readers = StoreExecutor(_READERS, "readers", executor.note_damage)
         self.fleet = FleetReader(store, presence, clocks.wall)
         self.changes = ChangeReader(self.fleet, self.readers, _readable_elsewhere(store))
         self.feed = FleetFeed(self.changes, presence, self._config.watchers, shared, damage)

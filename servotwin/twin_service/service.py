@@ -124,7 +124,7 @@ class TwinService:
         self.claims = self._make_claims()
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
-        self.pages = PageService(twin, store, damage, presence, self.claims, self.clocks, self._shared)
+        self.pages = PageService(twin, store, damage, presence, self.claims, self.clocks, self._shared, self.executor)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             live = self.pages.live_intake

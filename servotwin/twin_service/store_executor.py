@@ -24,6 +24,8 @@ class StoreExecutor:
     threads : int
     name : str
         Of the threads.
+    note_damage : callable, optional
+        Called with damage that a call found; by default it is kept as `damage`.
 
     Attributes
     ----------
@@ -33,8 +35,14 @@ class StoreExecutor:
         Damage that a call found; None: none since it was last set so.
     """
 
-    def __init__(self, threads: int = _THREADS, name: str = "store") -> None:
+    def __init__(
+        self,
+        threads: int = _THREADS,
+        name: str = "store",
+        note_damage: Callable[[StoreDamaged], None] | None = None,
+    ) -> None:
         self._threads = ThreadPoolExecutor(threads, name)
+        self._note_damage = note_damage or self.note_damage
         self._begun = dict[object, float]()
         self.fault = ""
         self.damage: StoreDamaged | None = None
@@ -43,6 +51,10 @@ class StoreExecutor:
     def waited(self) -> float:
         """Time for which the oldest call in progress has waited for its result, s; slow ones do not count."""
         return time.monotonic() - min(self._begun.values()) if self._begun else 0.0
+
+    def note_damage(self, error: StoreDamaged) -> None:
+        """Keep damage that a call found, here or in other threads."""
+        self.damage = error
 
     async def run(self, call: Callable[[], _Result], slow: bool = False) -> _Result:
         """Run a call in a thread; raises what it raises, above all StoreUnavailable. `slow`: it may take minutes."""
@@ -56,7 +68,7 @@ class StoreExecutor:
         except StoreUnavailable as error:
             self.fault = str(error)
             if isinstance(error, StoreDamaged):
-                self.damage = error
+                self._note_damage(error)
             raise
         finally:
             self._begun.pop(mark, None)

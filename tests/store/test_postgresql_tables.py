@@ -54,7 +54,7 @@ def run(store: Store, *statements: str) -> None:
 def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
     postgres_server: postgres.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine, "_BUSY_S", 0.2)
+    monkeypatch.setattr(engine, "_BUSY_S", 2.0)
     address = postgresql_addresses(postgres_server)()
     with closing(open_store(address)) as store:
         # A session of somebody else: one of a twin that does nothing in a transaction is ended sooner.
