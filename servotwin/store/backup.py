@@ -18,9 +18,18 @@ from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.runtime.sqlite_damage import damage_words
 from servotwin.store.claims import LOST_ANSWERS, alarm_row
-from servotwin.store.engine import POSTGRESQL, is_damage, parse_address, public_address, sqlite_file
+from servotwin.store.engine import (
+    POSTGRESQL,
+    SQLITE,
+    StoreUnavailable,
+    engines_of,
+    is_damage,
+    parse_address,
+    public_address,
+    sqlite_file,
+)
 from servotwin.store.integrity import STORED_BODIES, body_fault
-from servotwin.store.migrate import VERSIONS, checked_revision
+from servotwin.store.migrate import VERSIONS, checked_revision, migrate
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION, metadata, set_aside
 from servotwin.store.stored_value import WrongValue, wrong_value
@@ -140,7 +149,9 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> Copi
     _check_free(place)
     with atomic_output(place, PRIVATE) as temporary:
         copied = _copied(backed_up, temporary, place, progress)
+        _bring_up_to_date(temporary, place)
         with _opened(temporary, "mode=rw", place) as store:
+            store.execute("PRAGMA journal_mode = DELETE")
             store.executemany("INSERT INTO twins (servo) VALUES (?)", [(servo,) for servo in copied.left_out])
             # Serials that edges received after the backup must not be used again.
             # Not by a margin alone: a second restore of one backup would use those of the first.
@@ -150,6 +161,17 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> Copi
             if copied.left_out:
                 store.execute(f"DELETE FROM {set_aside.name}")
         return copied
+
+
+def _bring_up_to_date(file: Path, place: Path) -> None:
+    """Upgrade a copy of a store of an earlier revision: what follows is written into the tables of today."""
+    engines = engines_of(sa.URL.create(SQLITE, database=str(file)))
+    try:
+        migrate(engines.writer)
+    except StoreUnavailable as error:
+        raise _not_written(place, error) from None
+    finally:
+        engines.dispose()
 
 
 def _ask_for_windows(store: sqlite3.Connection, left_out: Mapping[str, str]) -> None:
@@ -272,7 +294,7 @@ def _opened(path: Path, mode: str, to: Path | None = None) -> Iterator[sqlite3.C
         raise InvalidInput(f"store {path}: {fault} ({damage_words(error)})") from None
 
 
-def _not_written(to: Path, error: sqlite3.Error) -> InvalidInput:
+def _not_written(to: Path, error: Exception) -> InvalidInput:
     return InvalidInput(f"output {to}: cannot be written ({error})")
 
 

@@ -4,12 +4,14 @@ import gzip
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from servotwin.messages import WindowMessage, decode, encode
+from servotwin.store.backup import backup, restore
 from servotwin.store.engine import transaction
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.records import MessageKind, PutResult
@@ -27,10 +29,16 @@ SERVO = "quick"
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
+def path(tmp_path: Path) -> Path:
+    """The file as it was left."""
     path = tmp_path / "twin.db"
     path.write_bytes(gzip.decompress((DATA / "twin.db.gz").read_bytes()))
     path.chmod(0o600)
+    return path
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[Store]:
     store = open_store(str(path))
     yield store
     store.close()
@@ -99,3 +107,12 @@ def test_the_twin_of_version_0_continues_from_its_stored_state(store: Store, tmp
     assert after is not None
     assert after.serial == before.serial + 1
     assert after.waiting == 0
+
+
+def test_its_backup_is_restored(path: Path, tmp_path: Path) -> None:
+    made, place = tmp_path / "backup.db", tmp_path / "new.db"
+    assert backup(str(path), made).rows == restore(made, str(place)).rows
+    with closing(open_store(str(path))) as old, closing(open_store(str(place))) as new:
+        assert new.windows(SERVO, 5) == old.windows(SERVO, 5)
+        assert new.audit(SERVO) == old.audit(SERVO)
+    assert not place.with_name(f"{place.name}-wal").exists()
