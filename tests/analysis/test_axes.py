@@ -1,6 +1,7 @@
 """Limit cycles, tuning and maps of axes made of parts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,19 @@ def test_a_dead_zone_without_anything_to_stop_is_refused() -> None:
 def test_a_stage_that_goes_where_it_is_told_settles() -> None:
     axis = st.Axis.preset("stepper-stage").replace(sample_rate=None)
     assert st.limit_cycle(axis, 0.01, step=1e-4).status is CycleStatus.SETTLES
+
+
+def test_a_motor_that_friction_holds_while_the_integral_grows_has_not_settled() -> None:
+    axis, gap = st.Axis.preset("micro-positioner").replace(sample_rate=None), 0.01
+    step = 0.3 * axis.p * gap
+    found = st.limit_cycle(axis, gap, step=step)
+    assert found.status is CycleStatus.IRREGULAR
+    assert "friction holds motor and load" in found.reason
+    run = st.simulate(axis, 260.0, reference=step, gap=gap, sample_rate=100.0)
+    still, later = run.position[1000:6000], run.position[6000:]
+    assert np.ptp(still) < 1e-9 * axis.p * gap < np.ptp(later)
+    held = axis.replace(controller=replace(axis.controller, Ki=0.0))
+    assert st.limit_cycle(held, gap, step=step).status is CycleStatus.SETTLES
 
 
 def test_the_time_of_settling_is_that_of_an_integrator_of_its_own() -> None:

@@ -1,4 +1,4 @@
-"""Limit cycles and margins of Every axis preset: exact map, describing function, long runs, and the tick."""
+"""Limit cycles and margins of every axis preset: exact map, describing function, long runs, and the tick."""
 
 import math
 from dataclasses import replace
@@ -50,6 +50,8 @@ SWINGS = {
 }
 # The stepper goes where it is told and its controller only integrates; the controller of the EMPS reads the motor.
 CALM = ("stepper-stage", "emps")
+# Friction holds the motor for minutes, until the integral has grown; then it slips.
+HUNTING = ("robot-joint", "micro-positioner")
 
 
 def gap_of(name: str) -> float:
@@ -121,11 +123,13 @@ def test_the_preset_ends_as_the_exact_map_says(name: str) -> None:
     axis, step = st.Axis.preset(name).replace(sample_rate=None), 30.0 * GAPS[name]
     found = limit_cycle(axis, gap_of(name), step=step)
     duration = 250.0 / axis.margins().gain_crossovers[0].omega
-    # Stick and slip of the joint take the integral a while.
-    duration *= 5.0 if name == "robot-joint" else 1.0
+    duration *= 40.0 if name in HUNTING else 1.0
     run = st.simulate(axis, duration, reference=step, gap=gap_of(name), sample_rate=20_000.0 / duration)
-    swing = 0.5 * np.ptp(run.position[-2000:])
-    if name == "two-mass-drive":
+    swing = 0.5 * np.ptp(run.position[-(8000 if name in HUNTING else 2000) :])
+    if name == "robot-joint":
+        assert found.status is CycleStatus.IRREGULAR
+        assert swing > 0.5 * GAPS[name]
+    elif name in ("two-mass-drive", "micro-positioner"):
         assert found.orbit is not None
         assert swing == pytest.approx(found.orbit.amplitude, rel=1e-2)
     else:

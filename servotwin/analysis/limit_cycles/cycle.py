@@ -33,6 +33,9 @@ from servotwin.plant.plants import Plant
 _FIRST_PART, _PARTS = 32, 8
 # Motion below this part of the gap (or of the tolerance) is rest; above this part it runs away.
 _REST, _AWAY = 1e-9, 1e9
+# Of the largest command: a motor at rest whose command moves by more is held by friction, until the command breaks it
+# loose.
+_WINDS = 1e-6
 # Share of the gap (or of the dead zone, or of the step) within which motor and position count as settled.
 _SETTLED = 0.01
 # Without integral action the motor crosses the gap ever more slowly, and never rests. It counts as settling when the
@@ -143,7 +146,7 @@ def _linear(servo: Plant, law: Law) -> CycleResult:
 
 def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
     """Search the run's end; `extent` is what `loop.extent` is the size of, in a word."""
-    reason, elapsed, moved, travels = "", 0.0, [], []
+    reason, elapsed, moved, travels, largest, held = "", 0.0, [], [], 0.0, False
     for run, travel in _parts(loop):
         elapsed += run.time
         if travel is None:
@@ -151,7 +154,11 @@ def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
             return CycleResult(CycleStatus.DIVERGES, None, reason)
         travels.append(travel)
         moved.append(float(np.ptp(travel[0])))
-        if np.ptp(travel[:, len(travel[0]) // 2 :], axis=1).max() <= _REST * loop.extent:
+        half, command = len(travel[0]) // 2, run.sampled(loop.loop.rows["voltage"])
+        largest = max(largest, float(np.max(np.abs(command))))
+        rests = np.ptp(travel[:, half:], axis=1).max() <= _REST * loop.extent
+        held = bool(rests and np.ptp(command[half:]) > _WINDS * largest)
+        if rests and not held:
             time = _settling(loop, travels)
             reason = f"motor and position stay within 1 % of the {extent} from {time:.3g} s on"
             return CycleResult(CycleStatus.SETTLES, None, reason, time)
@@ -164,6 +171,11 @@ def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
             return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
         kind = "a stable" if closed.orbit.stable else "an unstable"
         reason = f"{kind} orbit at {closed.orbit.frequency:.6g} Hz is {closed.distance:.2g} of its size away"
+    if held:
+        reason = (
+            f"friction holds motor and load after {elapsed:.4g} s, until the command, which still grows, frees them"
+        )
+        return CycleResult(CycleStatus.IRREGULAR, None, reason)
     late = max(moved[_PARTS // 2 :])
     if late < _CREEP * loop.extent and late < 0.25 * max(moved[1 : _PARTS // 2]):
         reason = f"the motor still creeps across the gap, but the position moves by {late * loop.unit:.2g} m at last"
