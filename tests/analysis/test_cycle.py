@@ -1,6 +1,7 @@
 """Exact limit cycles: known digits, the event simulation, finite differences and symmetries as judges."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -54,6 +55,19 @@ def test_known_digits_of_the_presets(preset, frequency, amplitude):
     assert found.symmetric
     assert found.stable
     assert found.residual < 1e-12
+
+
+@pytest.mark.slow
+def test_a_motion_that_passes_a_stable_orbit_does_not_end_on_it():
+    """It comes within 6 % of the orbit, and swings on beside it, by 22 % further."""
+    servo, gap, step = Servo.preset("paper"), 1.77e-3, -1.0925e-6
+    controller = replace(servo.controller, Kp=2304.384, Ki=25500.6, Kd=-53.29308)
+    found = limit_cycle(servo, gap, controller=controller, step=step)
+    assert found.status is CycleStatus.IRREGULAR
+    assert "a stable orbit at 1.53" in found.reason
+    run = simulate(servo, 400.0, controller=controller, reference=step, gap=gap, sample_rate=600.0)
+    swings = np.ptp(run.position[-60_000:].reshape(-1, 600), axis=1)  # of 100 seconds, each of 1.5 periods
+    assert swings.max() > 1.1 * swings.min()
 
 
 def test_known_multipliers_of_the_half_period():

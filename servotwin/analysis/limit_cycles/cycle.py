@@ -41,9 +41,10 @@ _SETTLED = 0.01
 # Without integral action the motor crosses the gap ever more slowly, and never rests. It counts as settling when the
 # position moves by less than this part of p gap in the later half of all parts, and by less than a quarter of before.
 _CREEP = 1e-3
-# Distance, in parts of each state's size, within which the run is taken to converge to a stable orbit; and within which
-# it is on an orbit that does not attract.
-_NEAR, _ON_IT = 0.1, 1e-6
+# Distance, in parts of each state's size, within which the run is taken to converge to a stable orbit: at once, or
+# where it was twice as far away before, since another motion may pass by. And within which it is on an orbit that does
+# not attract.
+_CLOSE, _NEAR, _ON_IT = 1e-3, 0.1, 1e-6
 
 
 class CycleStatus(Enum):
@@ -146,7 +147,7 @@ def _linear(servo: Plant, law: Law) -> CycleResult:
 
 def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
     """Search the run's end; `extent` is what `loop.extent` is the size of, in a word."""
-    reason, elapsed, moved, travels, largest, held = "", 0.0, [], [], 0.0, False
+    reason, elapsed, moved, travels, largest, held, before = "", 0.0, [], [], 0.0, False, 0.0
     for run, travel in _parts(loop):
         elapsed += run.time
         if travel is None:
@@ -154,10 +155,10 @@ def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
             return CycleResult(CycleStatus.DIVERGES, None, reason)
         travels.append(travel)
         moved.append(float(np.ptp(travel[0])))
-        half, command = len(travel[0]) // 2, run.sampled(loop.loop.rows["voltage"])
+        command = run.sampled(loop.loop.rows["voltage"])
         largest = max(largest, float(np.max(np.abs(command))))
-        rests = np.ptp(travel[:, half:], axis=1).max() <= _REST * loop.extent
-        held = bool(rests and np.ptp(command[half:]) > _WINDS * largest)
+        rests = _late(travel) <= _REST * loop.extent
+        held = rests and _late(command[None]) > _WINDS * largest
         if rests and not held:
             time = _settling(loop, travels)
             reason = f"motor and position stay within 1 % of the {extent} from {time:.3g} s on"
@@ -165,10 +166,12 @@ def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
         try:
             closed = _followed(loop, run)
         except LostOrbit as error:
-            reason = str(error)
+            reason, before = str(error), 0.0
             continue
-        if (closed.orbit.stable and closed.distance < _NEAR) or closed.distance < _ON_IT:
+        near = max(_CLOSE, min(0.5 * before, _NEAR)) if closed.orbit.stable else _ON_IT
+        if closed.distance < near:
             return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
+        before = closed.distance
         kind = "a stable" if closed.orbit.stable else "an unstable"
         reason = f"{kind} orbit at {closed.orbit.frequency:.6g} Hz is {closed.distance:.2g} of its size away"
     if held:
@@ -201,6 +204,11 @@ def _parts(loop: ScaledLoop) -> Iterator[tuple[Trajectory, Array | None]]:
                 return
         yield run, 0.5 * np.array([run.sampled(rows["position"]), loop.extent * run.sampled(rows["theta_m"])])
         state, mode = run.state, run.mode
+
+
+def _late(rows: Array) -> float:
+    """Largest range of rows (k, samples) in their later half."""
+    return float(np.ptp(rows[:, rows.shape[1] // 2 :], axis=1).max())
 
 
 def _settling(loop: ScaledLoop, travels: list[Array]) -> float:
