@@ -9,7 +9,7 @@ import numpy as np
 
 from servotwin.estimation.output_error.fit import Search, descend
 from servotwin.estimation.output_error.models import HALF
-from servotwin.estimation.output_error.rounding import influence, moved_by, rounded
+from servotwin.estimation.output_error.rounding import all_rounding, influence, moved_by, rounded
 from servotwin.estimation.output_error.search import LEFT_COUNTS, rms
 from servotwin.estimation.output_error.unexplained import slow
 from servotwin.plant.signals import Array
@@ -33,10 +33,8 @@ def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple
     """
     best, problem = found.best, found.problem
     sentences = []
-    variation = float(np.std(problem.position))
-    left = slow(best.raw, max(1, best.raw.size // 100))
-    share = left / variation if variation > 0.0 else math.inf
-    if share > UNEXPLAINED:
+    left = _left(found)
+    if (share := _share(found)) > UNEXPLAINED and not all_rounding(found):
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
     elif problem.model.speed == 0.0 and left > max(UNEXPLAINED * best.values[HALF], problem.count):
         sentences.append(
@@ -46,6 +44,25 @@ def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
+
+
+def too_small(found: Search) -> str:
+    """Sentence for a motion of so few counts that they hide whether the model explains it; empty: it is larger."""
+    if (share := _share(found)) <= UNEXPLAINED or not (hiding := all_rounding(found)):
+        return ""
+    return f"{hiding} ({100.0 * share:.0f} % of the motion): larger moves are needed"
+
+
+def _left(found: Search) -> float:
+    """rms (m or rad at the load) of the slow motion that the best fit leaves."""
+    raw = found.best.raw
+    return slow(raw, max(1, raw.size // 100))
+
+
+def _share(found: Search) -> float:
+    """The same, of the position's variation."""
+    variation = float(np.std(found.problem.position))
+    return _left(found) / variation if variation > 0.0 else math.inf
 
 
 def unusual_numbers(found: Search, likely: Array, shown: bool = False, rate: float = 0.0) -> tuple[str, ...]:

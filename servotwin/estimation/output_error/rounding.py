@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.search import LEFT_COUNTS, rms
 from servotwin.plant.signals import Array
 
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
@@ -74,3 +75,13 @@ def rounded(found: Search, which: int = HALF) -> float:
     """Standard deviation of an unknown that the rounding of the encoders makes."""
     rounding = influence(found, np.arange(found.best.residual.size), which)[2]
     return rounding if math.isfinite(rounding) else 0.0
+
+
+def all_rounding(found: Search) -> str:
+    """Sentence for a window in which rounding may be all that the best fit leaves; empty where it leaves more."""
+    count, position = found.problem.count, found.problem.position
+    if rms(found.best.raw) > LEFT_COUNTS * count:
+        return ""
+    counts = float(np.ptp(position)) / count
+    moved = f"the position moves by only {counts:.2g} counts of the coarser encoder"
+    return f"{moved}, whose rounding may be all that the model leaves"

@@ -15,10 +15,10 @@ from servotwin.estimation.output_error.carried import carried
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
-from servotwin.estimation.output_error.mismatches import DOUBT, grown, mismatches
+from servotwin.estimation.output_error.mismatches import DOUBT, grown, mismatches, too_small
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
-from servotwin.estimation.output_error.rounding import rounded
+from servotwin.estimation.output_error.rounding import all_rounding, rounded
 from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
@@ -91,6 +91,8 @@ def judge(
     against = mismatches(found, likely, settings.gap_rate / unit, settings.model_share * known.half)
     if against:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=against)
+    if small := too_small(found):
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(small,))
     single, likely_single = _single(found, known)
     if likely_single:
         bounded = _bounded(found, single, "one flank explains the window nearly as well as two")
@@ -100,7 +102,7 @@ def judge(
     if not doubts and _out_of_reach(found, known.half + NORMAL_95 * explained):
         return _bounded(found, single, "the interval contains gaps that the motor does not cross in the window")
     if not doubts and (softer := softer_is_better(found)):
-        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(softer,))
+        return _softer(found, softer)
     if not doubts:
         return JudgedFit(GapStatus.OK, known.half, known.std, explained)
     ratio = None
@@ -108,6 +110,13 @@ def judge(
         ratio = _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, known.std, known.total, reasons, ratio)
+
+
+def _softer(found: Search, words: str) -> JudgedFit:
+    """Decide on a window that a much softer shaft explains better: no mismatch where that is a matter of counts."""
+    if hiding := all_rounding(found):
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words, hiding))
+    return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(words,))
 
 
 class _KnownHalf(NamedTuple):
