@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from servotwin.control.laws import AnyController
 from servotwin.estimation.disturbance import disturbance
+from servotwin.estimation.drive_strength import DriveStrength
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Setting
@@ -52,6 +53,8 @@ class TwinModel:
         Sends the learnt structure to edges that can use it.
     controller : Controller, Cascade or LinearLaw, optional
         The servo's, with which windows are compared; None: they are not.
+    drive : DriveStrength, optional
+        Compares windows with the stated torque and inertia; None: it is another kind of machine.
     """
 
     estimator: Estimator
@@ -65,6 +68,7 @@ class TwinModel:
     motor: MotorLearning | None = None
     responses: Responses | None = None
     controller: AnyController | None = None
+    drive: DriveStrength | None = None
 
     @classmethod
     def of(
@@ -98,6 +102,7 @@ class TwinModel:
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
             controller=servo.controller,
+            drive=_drive_of(servo, settings),
         )
 
     def initial_state(self, servo: str) -> TwinState:
@@ -123,3 +128,9 @@ class TwinModel:
             responses=None if self.responses is None else state.responses or ResponseState(),
             lookups=None if self.lookups is None else state.lookups or LookupState(),
         )
+
+
+def _drive_of(servo: Plant, settings: TwinSettings) -> DriveStrength | None:
+    """Comparison with the torque for which settings are verified, stated or not."""
+    torque = 1.0 - (1.0 - settings.uncertainty.k_T) * (1.0 - settings.demands.beyond.k_T)
+    return DriveStrength.of(servo, torque, settings.uncertainty.m)

@@ -207,6 +207,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         m, size of a step made before the first window, by the way to rest; 0: none is known.
     other_controller : int
         Windows in a row whose voltage is not that of the controller stated for them.
+    other_drive : int
+        Windows in a row, of those that tell, whose command moves the axis otherwise than stated.
     newest : (str, float) or None
         Boot and start (s) of the newest window that was processed.
     introduced : bool
@@ -241,6 +243,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     oversight: Oversight = Oversight()
     ratio: UntoldRatio = UntoldRatio()
     search: LastSearch | None = None
+    other_drive: int = 0
 
     def with_sent(self, update: Update, now: float) -> TwinState:
         """Note the first sending of an update, with its setting: the receipt may get lost."""

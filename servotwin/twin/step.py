@@ -45,6 +45,7 @@ from servotwin.twin.answers import (
     take_wake,
 )
 from servotwin.twin.asking import ask
+from servotwin.twin.comparing import compare, not_as_stated
 from servotwin.twin.estimating import OTHER_CONTROLLER, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     ActRecord,
@@ -68,7 +69,6 @@ from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
 _BY_TURNS = "the gap falls and rises by turns: a setting follows when it has been one for some windows"
-_OTHER = "the voltage is not that of the stated controller: a setting follows when that of a window is"
 _OVERTAKEN = "a newer window of this servo has come: the setting follows from that"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
@@ -291,7 +291,7 @@ def _learn(
         AlarmRecord(message, sentence) for sentence in after.alarms(before, estimate, trends, learning, model.motor)
     ]
     if not stale:
-        state, differs = _compare(model, state, decoded)
+        state, differs = compare(model, state, decoded)
         records += [AlarmRecord(message, sentence) for sentence in differs]
     return state, _Learnt(estimate, disturbed, rejection, stale), records
 
@@ -312,16 +312,6 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         state.usual_steps,
         state.search,
     )
-
-
-def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
-    """Compare a window's voltage with that of the controller stated for it; return the alarm, if it is one."""
-    made = decoded.compare_controller(model.controller, state.known.get(decoded.message.parameter_version))
-    if made is None:
-        return state, []
-    before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
-    count = max(count, OTHER_CONTROLLER) if made.misread else count  # one such window is enough
-    return replace(state, other_controller=count), [made.sentence] if count == OTHER_CONTROLLER > before else []
 
 
 def _glance(
@@ -358,8 +348,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
     if state.wear.by_turns and not stale:
         return state, Redesign(None, math.nan, _BY_TURNS)
-    if state.other_controller >= OTHER_CONTROLLER and not stale:
-        return state, Redesign(None, math.nan, _OTHER)
+    if (other := not_as_stated(state)) and not stale:
+        return state, Redesign(None, math.nan, other)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale:
         return state, Redesign(None, math.nan, evidence.why_not)

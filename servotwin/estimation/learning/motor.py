@@ -129,7 +129,7 @@ def motor_rows(window: Window, servo: Servo, limit: float | None = None) -> Moto
         return None
     interval = 1.0 / window.sample_rate
     width = max(_WIDTH_S * scales(servo).time, _WIDTH_SAMPLES * interval) / interval
-    filters = _filters(width)
+    filters = gaussian_filters(width)
     size, stride = filters.shape[1], max(1, round(_SPACING * width))
     if window.position.size < size + stride * _FEWEST:
         return None
@@ -349,7 +349,7 @@ def _least_speed(window: Window, servo: Servo, speed: Array, kernel: Array) -> f
 
 
 @lru_cache(maxsize=8)
-def _filters(width: float) -> Array:
+def gaussian_filters(width: float) -> Array:
     """(4, n) weights of a Gaussian of `width` samples about its middle: of a held signal, and of the derivatives of one
     to three samples^-1 of a sampled one."""
     # Here, because scipy.special takes long to import and many processes estimate nothing.
