@@ -105,6 +105,22 @@ def test_two_machines_under_one_name_get_no_setting_until_three_windows_in_a_row
     assert "two machines" in seen.redesigns[4].reason
 
 
+def test_a_window_that_tells_nothing_of_the_machine_is_no_other_machines():
+    """Said was "the machine is not the one that was learnt: k/m +0 ± 16 %, and k/m +0 ± 16 % was learnt"."""
+    fits = iter([True, False, True])
+
+    def estimate(window, _expected):
+        status = GapStatus.OK if next(fits) else GapStatus.MODEL_MISMATCH
+        reading = MachineReading((0.0, 0.0, 0.0, 0.0), tuple(np.diag([0.08**2, 0.5**2, 0.005**2, 0.05**2]).ravel()))
+        middle = window.start + 0.5 * window.duration
+        return GapEstimate(0.1, 1e-3, 1e-3, (0.098, 0.102), status, middle, machine=reading)
+
+    model = TwinModel.of(MODEL, TwinSettings(policy="margin"), estimator=estimate)
+    seen = Seen([window_message(number, 10.0 * number) for number in range(3)], model)
+    assert seen.alarms == ["", "", ""]
+    assert [redesign.setting is not None for redesign in seen.redesigns] == [True, False, True]
+
+
 @pytest.mark.slow
 def test_a_machine_that_was_exchanged_for_good_is_learnt_and_gets_its_settings():
     """Once it is learnt, windows of the old one are those of a second machine."""

@@ -231,7 +231,12 @@ def updated(
 def _contradicted(
     before: LearntMachine, settings: LearningSettings, reading: MachineReading, now: float
 ) -> LearntMachine:
-    """The learnt machine after a window that only other numbers explain: the alarm, and the rival."""
+    """The learnt machine after a window that only other numbers explain: the alarm, and the rival.
+
+    Numbers that agree with the learnt ones, as those of a window that tells nothing of them, are no other machine's.
+    """
+    if _distance(before.prior(settings, now), reading) <= _AGREEMENT:
+        return before
     rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
     if before.rival is not None and _distance(before.rival.prior(settings, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
