@@ -32,7 +32,7 @@ _SLIDES, _SURE = 0.01, 5.0  # of the highest speed; standard deviations of its n
 _LONG, _FEWEST = 10.0, 10  # widths of a stretch; rows beyond the unknowns
 _DELAYS = np.arange(0.0, 4.01, 0.25)  # samples by which the command may be late
 _NEAR_LIMIT = 0.1  # of the drive's limit
-_UNEXPLAINED = 0.05  # of the impulse: with more of it unexplained a window does not count
+_UNEXPLAINED = 0.1  # of the impulse: with more of it unexplained a window does not count
 _KNOWN = 0.05  # relative standard deviation of a window that counts
 # Friction of another kind, and motions that are hardly longer than the filter, moved the strength of 110 windows of 36
 # simulated axes by at most 16 %.
