@@ -29,7 +29,7 @@ from servotwin.plant.signals import Array
 _WIDTHS = (2.5, 4.0, 6.0, 10.0, 16.0, 25.0, 40.0)  # samples: standard deviations of the filter that are tried
 _NOISE = 0.005  # of the momentum's range: what noise and counts may leave of it behind the filter
 _SLIDES, _SURE = 0.01, 5.0  # of the highest speed; standard deviations of its noise: slower is no sliding
-_LONG, _FEWEST = 10.0, 10  # widths of a stretch; rows beyond the unknowns
+_LONG, _FEWEST = 6.0, 6  # widths of a stretch; rows beyond the unknowns
 _DELAYS = np.arange(0.0, 4.01, 0.25)  # samples by which the command may be late
 _NEAR_LIMIT = 0.1  # of the drive's limit
 _UNEXPLAINED = 0.1  # of the impulse: with more of it unexplained a window does not count

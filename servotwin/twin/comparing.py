@@ -16,11 +16,11 @@ _DRIVE = "the command does not move the axis as strongly as stated: a setting fo
 def compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
     """Compare a window's voltage with that of the controller stated for it, and its motion with the voltage.
 
-    The second only where the first agrees: another channel is no command. Returned with the alarms.
+    The second not where the first differs: another channel is no command. Returned with the alarms.
     """
     made = decoded.compare_controller(model.controller, state.known.get(decoded.message.parameter_version))
     if made is None:
-        return state, []
+        return _compare_drive(model, state, decoded)
     before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
     count = max(count, OTHER_CONTROLLER) if made.misread else count  # one such window is enough
     state = replace(state, other_controller=count)

@@ -45,7 +45,14 @@ def known(window: Window, _expected: object) -> GapEstimate:
 
 @pytest.mark.parametrize(
     ("name", "torque"),
-    [("ball-screw", 0.5), ("ball-screw", 0.9), ("gantry", 0.9), ("gantry", 2.0), ("two-mass-drive", 2.0)],
+    [
+        ("ball-screw", 0.5),
+        ("ball-screw", 0.9),
+        ("ball-screw", 2.0),
+        ("gantry", 0.9),
+        ("gantry", 2.0),
+        ("two-mass-drive", 2.0),
+    ],
 )
 def test_a_window_shows_the_torque_that_a_command_makes(name: str, torque: float) -> None:
     [window] = windows(name, torque, count=1)
