@@ -32,7 +32,9 @@ _SLIDES, _SURE = 0.01, 5.0  # of the highest speed; standard deviations of its n
 _LONG, _FEWEST = 6.0, 6  # widths of a stretch; rows beyond the unknowns
 _DELAYS = np.arange(0.0, 4.01, 0.25)  # samples by which the command may be late
 _NEAR_LIMIT = 0.1  # of the drive's limit
-_UNEXPLAINED = 0.1  # of the impulse: with more of it unexplained a window does not count
+# Of the impulse: with more of it unexplained a window does not count; half, where the delay that fits best is none of
+# those within the range, but stands for another force.
+_UNEXPLAINED = 0.1
 _KNOWN = 0.05  # relative standard deviation of a window that counts
 # Friction of another kind, and motions that are hardly longer than the filter, moved the strength of 110 windows of 36
 # simulated axes by at most 16 %.
@@ -101,9 +103,12 @@ def strength(window: Window, axis: Axis) -> tuple[float, float] | None:
     found = _stretches(window, axis)
     if found is None:
         return None
-    fits = [fit for delay in _DELAYS if (fit := _fitted(found, window, axis, float(delay))) is not None]
-    best = min(fits, key=lambda fit: fit.left, default=None)
-    if best is None or not best.inertia > 0.0 or best.left > _UNEXPLAINED or best.std > _KNOWN:
+    fits = [(delay, fit) for delay in _DELAYS if (fit := _fitted(found, window, axis, float(delay))) is not None]
+    if not fits:
+        return None
+    delay, best = min(fits, key=lambda each: each[1].left)
+    allowed = _UNEXPLAINED if _DELAYS[0] < delay < _DELAYS[-1] else 0.5 * _UNEXPLAINED
+    if not best.inertia > 0.0 or best.left > allowed or best.std > _KNOWN:
         return None
     return 1.0 / best.inertia, best.std
 
