@@ -143,3 +143,12 @@ def test_channels_that_are_both_in_other_units_are_told_by_their_counts(angle: f
     assert "both seem to be in other units" in made.reasons[0]
     # One channel alone may come in steps of the log.
     assert other_units(window.replace(position=position * window.position), angle_count, position_count) == ()
+
+
+@pytest.mark.parametrize("seed", [48, 139, 168, 239])
+def test_counts_that_repeat_by_chance_at_rest_were_not_held(seed: int) -> None:
+    """Noise of 1.5 counts, before a move from 2 s on and after it: of 100 such windows three were refused."""
+    random, time = np.random.default_rng(seed), np.arange(24000) / 5000.0
+    way = 8000.0 * (1.0 - np.exp(-6.0 * np.clip(time - 2.0, 0.0, None)))
+    position = np.round(way + random.normal(0.0, 1.5, time.size))
+    assert faults(Window(position, way, sample_rate=5000.0)) == ()

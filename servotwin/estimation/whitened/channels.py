@@ -160,8 +160,13 @@ def _repeating(name: str, steps: Array) -> str:
 
 
 def _abrupt(side: Array, least: float) -> bool:
-    """True where the first of some steps is beyond `least` and beyond the change of speed in the others."""
-    return side.size == RUN and bool(abs(side[0]) > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
+    """True where the first of some steps is beyond `least` and beyond the change of speed in the others.
+
+    All go one way: steps to and fro are the noise of a channel at rest, whose counts repeat by chance.
+    """
+    if side.size < RUN or np.any(side * side[0] <= 0.0):
+        return False
+    return bool(abs(side[0]) > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
 
 
 def _encoder_noise(theta_m: Array) -> float:
