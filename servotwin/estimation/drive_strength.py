@@ -36,7 +36,7 @@ _NEAR_LIMIT = 0.1  # of the drive's limit
 # those within the range, but stands for another force.
 _UNEXPLAINED = 0.1
 _KNOWN = 0.05  # relative standard deviation of a window that counts
-# Friction of another kind, and motions that are hardly longer than the filter, moved the strength of 600 windows of
+# Friction of another kind, and motions that are hardly longer than the filter, moved the strength of 280 windows of
 # simulated axes by at most 22 %.
 _UNSURE = 0.25
 
