@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 import sys
 import time
 from array import array
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from servotwin.runtime.files import replace_file
+from servotwin.runtime.log_stream import LogStream
 
 if TYPE_CHECKING:
     from servotwin.link.sqlite_outbox import SqliteOutbox
@@ -53,16 +53,15 @@ class TroubleLog:
                 log("trouble over", where=where)
 
 
+_stream = LogStream(None)
+
+
 def log(event: str, **values: Any) -> None:
-    """Write one JSON line to the standard error; the line is lost where that is closed or nobody reads it."""
-    line = {"time": round(time.time(), 3), "event": event, **values}
-    stream: TextIO | None = sys.stderr
-    try:
-        if stream is not None and _is_writable(stream):
-            stream.write(msgspec.json.encode(line).decode() + "\n")
-            stream.flush()
-    except (OSError, ValueError):
-        return
+    """Write one JSON line to the standard error; where that is closed, or nobody reads it, the next line counts it."""
+    lost = {"lines_lost": _stream.lost} if _stream.lost else {}
+    line = {"time": round(time.time(), 3), "event": event, **values, **lost}
+    _stream.stream = sys.stderr
+    _stream.write(msgspec.json.encode(line).decode())
 
 
 def log_outbox(outbox: SqliteOutbox) -> None:
@@ -79,15 +78,6 @@ def log_outbox(outbox: SqliteOutbox) -> None:
     while outbox.salvages:
         found = outbox.salvages.pop(0)
         log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)
-
-
-def _is_writable(stream: TextIO) -> bool:
-    """True where writing would not block; a pipe whose reader has stopped is full one day."""
-    try:
-        descriptor = stream.fileno()
-    except (OSError, ValueError):
-        return True  # not a file of the system (a test's StringIO): writing does not block
-    return bool(select.select([], [descriptor], [], 0.0)[1])
 
 
 def write_status(path: Path, status: Mapping[str, Any]) -> None:

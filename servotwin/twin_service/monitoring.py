@@ -17,6 +17,7 @@ from typing import Any, TextIO
 import msgspec
 
 from servotwin.messages import Reason, Refusal
+from servotwin.runtime.log_stream import LogStream
 from servotwin.runtime.prometheus import Sample, metric_lines, number_text
 
 _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -26,6 +27,8 @@ _WATCHED = ("alarm", "failed", "fallback", "withdrawn")
 """Kinds of evidence that an operator must see."""
 _POSTED = ("taken", "refused", "dropped")
 _MOST_LINES, _LINES_PER_S = 100.0, 1.0
+_SERVERS = "uvicorn", "asyncio"
+"""Loggers of the HTTP server."""
 _Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
@@ -152,7 +155,7 @@ class RefusalLog:
 
 
 class _ServerLines(logging.Filter):
-    """Limits the lines of the HTTP server, one of which any bytes that are no request cause."""
+    """Limits the lines of the HTTP server and of asyncio, one of which any bytes or connections may cause."""
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -160,7 +163,7 @@ class _ServerLines(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Let a line pass, with the number of those `omitted` before it."""
-        if not record.name.startswith("uvicorn"):
+        if not record.name.startswith(_SERVERS):
             return True
         omitted = self._limit.take(str(record.msg))
         if omitted:
@@ -244,22 +247,42 @@ class _JsonLines(logging.Formatter):
         return msgspec.json.encode(line, enc_hook=str).decode()
 
 
+class _LinesNeverWaited(logging.Handler):
+    """Writes lines without waiting for their reader, which would hold up all edges; counts those that are lost.
+
+    Parameters
+    ----------
+    stream : TextIO
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._stream = LogStream(stream)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record's line; the first one after lines that were lost has their number as `lines_lost`."""
+        if self._stream.lost:
+            record.lines_lost = self._stream.lost
+        self._stream.write(self.format(record))
+
+
 def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handler:
     """Log to `stream` (standard error) from `level` on; returns the handler, so that it can be removed.
 
-    uvicorn logs only warnings: its access log would hold every request. The driver of PostgreSQL logs only errors: its
+    uvicorn and asyncio log only warnings: an access log would hold every request. The driver of PostgreSQL logs only errors: its
     warnings repeat in other words what it raises.
     """
-    handler = logging.StreamHandler(stream or sys.stderr)
+    handler = _LinesNeverWaited(stream or sys.stderr)
     handler.setFormatter(_JsonLines())
     handler.addFilter(_ServerLines())
     service = logging.getLogger("servotwin")
     service.setLevel(level.upper())
-    server = logging.getLogger("uvicorn")
-    server.setLevel(logging.WARNING)
+    servers = [logging.getLogger(name) for name in _SERVERS]
+    for server in servers:
+        server.setLevel(logging.WARNING)
     driver = logging.getLogger("psycopg")
     driver.setLevel(logging.ERROR)
-    for logger in (service, server, driver):
+    for logger in (service, *servers, driver):
         logger.addHandler(handler)
         logger.propagate = False
     return handler

@@ -1,9 +1,17 @@
 """Lines of the twin's log that the alarms page explains come when what they say happens."""
 
 import asyncio
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import pytest
 from service_system import bearer, place, served, twin_file, window
 
@@ -131,3 +139,32 @@ def test_a_worker_that_does_not_start_is_said_and_tried_again(tmp_path: Path, ca
 
     asyncio.run(body())
     assert "worker replaced" in caplog.messages
+
+
+def test_a_twin_whose_log_nobody_reads_serves_and_ends(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x" * 4096)
+    os.set_blocking(writer, True)
+    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(twin_file(tmp_path))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=writer, text=True) as twin:
+        assert twin.stdout is not None
+        try:
+            assert select.select([twin.stdout], [], [], 60.0)[0], "it waits for the reader of its log"
+            url = twin.stdout.readline().split()[-1]
+            refused = httpx.get(f"{url}/v1/servos", timeout=10.0)
+            assert (refused.status_code, httpx.get(f"{url}/healthz", timeout=10.0).status_code) == (401, 200)
+            os.set_blocking(reader, False)
+            with contextlib.suppress(BlockingIOError):
+                while os.read(reader, 4096):
+                    pass
+            httpx.get(f"{url}/v1/servos", timeout=10.0)
+            assert json.loads(os.read(reader, 4096).splitlines()[-1])["lines_lost"] >= 2  # "new store", and a refusal
+            twin.send_signal(signal.SIGTERM)
+            assert twin.wait(30) == 0
+        finally:
+            twin.kill()
+            os.close(reader)
+            os.close(writer)

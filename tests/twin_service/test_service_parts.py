@@ -199,7 +199,7 @@ def logged(stream: io.StringIO) -> Iterator[None]:
     try:
         yield
     finally:
-        for name in ("servotwin", "uvicorn"):
+        for name in ("servotwin", "uvicorn", "asyncio"):
             logging.getLogger(name).removeHandler(handler)
             logging.getLogger(name).propagate = True
             logging.getLogger(name).setLevel(logging.NOTSET)
@@ -231,10 +231,11 @@ def test_a_flood_of_bytes_that_are_no_request_writes_few_lines():
         for _ in range(5000):
             logging.getLogger("uvicorn.error").warning("Invalid HTTP request received.")
         logging.getLogger("uvicorn.error").warning("Unsupported upgrade request.")
+        logging.getLogger("asyncio").warning("socket.send() raised exception.")
         logging.getLogger("servotwin.test").warning("another")
     lines = [json.loads(line)["message"] for line in stream.getvalue().splitlines()]
-    assert len(lines) == 102
-    assert lines[-2:] == ["Unsupported upgrade request.", "another"]
+    assert len(lines) == 103
+    assert lines[-3:] == ["Unsupported upgrade request.", "socket.send() raised exception.", "another"]
 
 
 def test_a_flood_of_refusals_writes_few_lines_and_tells_how_many_it_left_out(caplog):
