@@ -20,7 +20,8 @@ from servotwin.store.engine import StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.store import Store, open_store
 from servotwin.twin_service.auth import read_tokens
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.http_server import HttpServer, check_tls, listening_socket, raise_descriptor_limit
+from servotwin.twin_service.http_server import HttpServer, check_tls
+from servotwin.twin_service.listening import listening_socket, raise_descriptor_limit
 from servotwin.twin_service.monitoring import configure_logging
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import TwinFile, read_twin

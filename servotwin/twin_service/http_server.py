@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import resource
 import signal
 import socket
 import ssl
@@ -23,6 +22,7 @@ from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_messages import ABORT
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
+from servotwin.twin_service.listening import BACKLOG, most_descriptors
 from servotwin.twin_service.tls_handshakes import TlsHandshakes, address_of
 from servotwin.twin_service.unauthenticated import UnauthenticatedConnection, UnauthenticatedLimit
 
@@ -31,8 +31,6 @@ _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 _DRAIN_BYTES, _DRAIN_S = 256 * 1024, 2.0
 """Rest of a body that is still received, and discarded, after its request was answered; then the connection ends. An
 edge whose token is no longer valid can so read its answer, and a client without one holds nothing."""
-_BACKLOG = 2048
-"""Connections that wait to be accepted: after an outage all edges connect at once."""
 _BODY_MEMORY = 256 * 1024 * 1024
 """Bytes of all bodies that are being received at once."""
 _GRACE_S = 20
@@ -245,7 +243,7 @@ class HttpServer(uvicorn.Server):
     ) -> None:
         super().__init__(_server_config(config, app, unauthenticated))
         self._handshakes: TlsHandshakes | None = None
-        self._most_handshakes = config.unauthenticated_connections
+        self._most_handshakes = min(config.unauthenticated_connections, max(1, most_descriptors() // 3))
         self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
@@ -304,35 +302,13 @@ def _server_config(config: ServiceConfig, app: HttpApp, unauthenticated: Unauthe
         server_header=False,
         date_header=False,
         proxy_headers=False,
-        backlog=_BACKLOG,
+        backlog=BACKLOG,
         timeout_keep_alive=_IDLE_S,
         timeout_graceful_shutdown=_GRACE_S,
         ssl_certfile=config.tls_certificate,
         ssl_keyfile=config.tls_key,
         ssl_ciphers=_CIPHERS,
     )
-
-
-def listening_socket(config: ServiceConfig, port: int | None = None) -> socket.socket:
-    """Open a socket that listens at the service's address.
-
-    Raises
-    ------
-    InvalidInput
-        The address is in use, or does not belong to this machine.
-    """
-    where = config.bind, config.port if port is None else port
-    family = socket.AF_INET6 if ":" in config.bind else socket.AF_INET
-    # The protocol is named: asyncio sets TCP_NODELAY only on sockets that say TCP; without it responses take 50 ms.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(where)
-        listener.listen(_BACKLOG)
-        return listener
-    except OSError as error:
-        listener.close()
-        raise InvalidInput(f"bind = {where[0]!r}, port = {where[1]}: cannot listen there ({error.strerror})") from None
 
 
 def check_tls(config: ServiceConfig) -> None:
@@ -353,12 +329,6 @@ def check_tls(config: ServiceConfig) -> None:
             f"tls_certificate {certificate}, tls_key {key}: are no certificate with its own key, in PEM and without a "
             f"password ({getattr(error, 'reason', None) or error})"
         ) from None
-
-
-def raise_descriptor_limit() -> None:
-    """Allow as many connections as the system grants one process."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def _url(listener: socket.socket, tls: bool) -> str:

@@ -269,8 +269,8 @@ class _LinesNeverWaited(logging.Handler):
 def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handler:
     """Log to `stream` (standard error) from `level` on; returns the handler, so that it can be removed.
 
-    uvicorn and asyncio log only warnings: an access log would hold every request. The driver of PostgreSQL logs only errors: its
-    warnings repeat in other words what it raises.
+    uvicorn and asyncio log only warnings: an access log would hold every request. The driver of PostgreSQL logs only
+    errors: its warnings repeat in other words what it raises.
     """
     handler = _LinesNeverWaited(stream or sys.stderr)
     handler.setFormatter(_JsonLines())

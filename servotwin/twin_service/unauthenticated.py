@@ -9,6 +9,7 @@ from collections.abc import Callable
 from servotwin.twin_service.auth import AccessControl, bearer_token
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_messages import cookie_of
+from servotwin.twin_service.listening import most_descriptors
 from servotwin.twin_service.servo_connections import ServoConnections
 from servotwin.twin_service.sessions import COOKIE, OperatorAccess
 
@@ -48,7 +49,9 @@ class UnauthenticatedLimit:
         if config.tokens is None or config.behind_proxy:
             return None
         of_servos = ServoConnections(config.connections_per_servo)
-        most, per_address = config.unauthenticated_connections, config.unauthenticated_per_address
+        # A third of the descriptors at most, and another one of TLS handshakes: the rest is for edges and the store.
+        most = min(config.unauthenticated_connections, max(1, most_descriptors() // 3))
+        per_address = config.unauthenticated_per_address
         return cls(access, operators, most, per_address, of_servos)
 
     @property

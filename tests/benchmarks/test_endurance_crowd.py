@@ -11,7 +11,8 @@ from service_system import OTHER, TOKEN, served, twin_file, window
 from benchmarks.endurance_crowd import ACKNOWLEDGED, STATUS, STOP, Crowd, CrowdPlan, CrowdServo
 from servotwin.link.seal import Sealed
 from servotwin.messages import Receipt, Setting, Update, decode, encode
-from servotwin.twin_service.http_server import HttpServer, listening_socket
+from servotwin.twin_service.http_server import HttpServer
+from servotwin.twin_service.listening import listening_socket
 
 
 @pytest.mark.slow

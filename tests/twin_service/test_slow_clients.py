@@ -13,7 +13,8 @@ from selfsigned import self_made
 from service_system import TOKEN, bearer, served, twin_file
 
 from servotwin.twin_service import http_server, tls_handshakes
-from servotwin.twin_service.http_server import HttpServer, listening_socket
+from servotwin.twin_service.http_server import HttpServer
+from servotwin.twin_service.listening import listening_socket
 
 PATIENCE = 30.0
 PUT = b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nHost: t\r\nAuthorization: Bearer " + TOKEN.encode()

@@ -8,7 +8,8 @@ import pytest
 from service_system import OPERATOR, OTHER, TOKEN, served, twin_file
 
 from servotwin.twin_service import http_edge, unauthenticated
-from servotwin.twin_service.http_server import HttpServer, listening_socket
+from servotwin.twin_service.http_server import HttpServer
+from servotwin.twin_service.listening import listening_socket
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 Connect = Callable[..., Awaitable[Stream]]
