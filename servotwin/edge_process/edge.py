@@ -31,6 +31,8 @@ CHECK_PERIOD_S, STATUS_PERIOD_S, PAUSE_S = 0.1, 1.0, 0.005
 _LONGEST_WAIT_FOR_LINK_S = 1.0
 _LONGEST_GAP_S = 1.0
 """Time without samples after which a new boot begins."""
+_NAMES = 10.0
+"""Boots without a window that may follow each other at once."""
 
 
 class _LinkProcessChild(Protocol):
@@ -99,7 +101,8 @@ class EdgeRuntime:
         self._boot, self._boots, self._superseded = boot, 0, False
         self._outlet, self._child, self._recorder = outlet, child, recorder
         self._manager = manager or ServiceManager({})
-        self._check_due = self._status_due = clock()
+        self._check_due = self._status_due = self._named_at = clock()
+        self._names = _NAMES
         self.agent = self._new_agent(first)
 
     def skip(self, missing: int, reference: float, voltage: float) -> None:
@@ -123,12 +126,21 @@ class EdgeRuntime:
 
     def _new_boot(self, why: str) -> None:
         """Begin a new boot, on the parameters in force."""
-        # Samples count from 0 again, so the boot needs another name: the twin must not confuse their windows.
-        self._boots += 1
         self.counts[f"boot: {why}"] += 1
-        self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters())
+        # Samples count from 0 again, so the boot needs another name: the twin must not confuse their windows. Where a
+        # drive misnumbers every sample, one without windows keeps its name, or its boots would fill log and store.
+        named = self.agent.windows_cut > 0 or self._may_name()
+        self._boots += named
+        self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters(), named)
         if self._superseded:
             self.send(self.agent.superseded())
+
+    def _may_name(self) -> bool:
+        """True for the first few boots, and for one a second later on."""
+        now = self.clock()
+        self._names, self._named_at = min(_NAMES, self._names + now - self._named_at), now
+        self._names -= (may := self._names >= 1.0)
+        return may
 
     def exchange(self) -> None:
         """Exchange a piece with the link process, and give the agent the messages that have arrived."""
@@ -191,15 +203,16 @@ class EdgeRuntime:
             self._child.check(self.clock())
             self.pause(PAUSE_S)
 
-    def _new_agent(self, first: Parameters | None) -> Agent:
+    def _new_agent(self, first: Parameters | None, named: bool = True) -> Agent:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
         self._outlet.boot = boot
         settings = replace(self.config.agent, boot=boot)
         store = _LinkParameterStore(first, self._outlet)
         agent = Agent(settings, store=store, outlet=self._outlet, recorder=self._recorder)
-        self._outlet.send_letter(agent.hello())
-        tolerance = {self.config.units.key("tolerance_m"): agent.parameters.setting.tolerance}
-        log("boot", boot=boot, version=agent.parameters.version, **tolerance)
+        if named:
+            self._outlet.send_letter(agent.hello())
+            tolerance = {self.config.units.key("tolerance_m"): agent.parameters.setting.tolerance}
+            log("boot", boot=boot, version=agent.parameters.version, **tolerance)
         return agent
 
     def _status(self) -> StatusFrame:

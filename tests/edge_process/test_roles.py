@@ -170,6 +170,25 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: LinkEnd) -> None:
     assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
 
 
+def test_a_drive_that_misnumbers_every_sample_fills_neither_log_nor_outbox(
+    far: LinkEnd, capfd: pytest.CaptureFixture[str]
+) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    drive = ScriptedDrive([*[DriveSample(7, 1e-3, 0.0, 0.0)] * 1000, *samples(8, 15)])
+    role = ControlRole(edge, drive)
+    while drive.given:
+        role.step()
+    exchange_all(box)
+    received = far.received()
+    hellos = [frame for frame in received if isinstance(frame, frames.LetterFrame)]
+    (window,) = (frame for frame in received if isinstance(frame, frames.WindowFrame))
+    assert edge.counts == {"boot: machine counts anew": 999}
+    assert len(hellos) == capfd.readouterr().err.count('"event":"boot"') <= 15
+    assert window.boot == decode(hellos[-1].body).boot  # type: ignore[union-attr]
+
+
 def test_an_edge_that_was_superseded_takes_no_update_in_a_later_boot_either(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
