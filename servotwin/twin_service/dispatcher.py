@@ -132,11 +132,11 @@ class Dispatcher:
             task.add_done_callback(self._tasks.discard)
 
     async def stop(self) -> None:
-        """Start nothing new, finish what is running, release the leases."""
+        """Start nothing new, give what is running some time, release the leases."""
         self._stopping = True
         self._work_pending.set()  # ends the rest of `run`
-        while self._tasks:
-            await asyncio.wait(self._tasks)
+        if self._tasks:
+            await self._pool.finish(self._tasks)
         try:
             await self._executor.run(partial(self._store.release, self._owner))
         except StoreUnavailable as error:
@@ -296,7 +296,8 @@ class Dispatcher:
         if current is not None:
             self._fail(current, why)
         self._to_release.update(left[1:])
-        await self._pool.replace(worker, why)
+        if not self._stopping:
+            await self._pool.replace(worker, why)
         self.wake()
 
     async def _complete(

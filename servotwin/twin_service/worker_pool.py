@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
 from servotwin.runtime.retry import Backoff, Retry
@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 
 _START_TRIES = 3
 """Times that a worker is started before the service gives up its own start."""
+_FINISH_S, _KILLED_S = 15.0, 5.0
+"""s at the end for work that is running, and then for noting that its workers were killed."""
 _MB = 1e6
 
 
@@ -151,7 +153,34 @@ class WorkerPool:
             self._idle.put_nowait(fresh)
             return
 
+    async def finish(self, tasks: set[asyncio.Task[None]]) -> None:
+        """Give tasks that use workers some time to end, and kill their workers then: their work is not committed.
+
+        Parameters
+        ----------
+        tasks : set of Task
+            Tasks leave it when they end.
+        """
+        if await _ended(tasks, _FINISH_S):
+            return
+        idle = {self._idle.get_nowait() for _ in range(self._idle.qsize())}
+        busy = self._workers - idle
+        log.warning("work not finished at the end: it is repeated", extra={"workers": len(busy)})
+        await asyncio.gather(*(worker.kill() for worker in busy))
+        if not await _ended(tasks, _KILLED_S):  # as where a worker that was lost before does not start again
+            for task in tasks:
+                task.cancel()
+
     async def stop(self) -> None:
         """Stop all workers."""
         await asyncio.gather(*(worker.stop() for worker in self._workers))
         self._workers.clear()
+
+
+async def _ended(tasks: set[asyncio.Task[None]], seconds: float) -> bool:
+    """Wait until a set of tasks is empty; False: it is not after that time."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while tasks:
+                await asyncio.wait(tasks)
+    return not tasks

@@ -66,6 +66,10 @@ class Lender:
     async def replace(self, _worker, _why) -> None:
         pass
 
+    async def finish(self, tasks) -> None:
+        while tasks:
+            await asyncio.wait(tasks)
+
     async def work(
         self, claims: Sequence[Lease], _now: float, urgency: Sequence[WorkerUrgency] = ()
     ) -> AsyncIterator[LeaseResult]:
