@@ -263,7 +263,12 @@ class _LinesNeverWaited(logging.Handler):
         """Write a record's line; the first one after lines that were lost has their number as `lines_lost`."""
         if self._stream.lost:
             record.lines_lost = self._stream.lost
-        self._stream.write(self.format(record))
+        try:
+            line = self.format(record)
+        except Exception:  # a line that is wrong must not end what writes it
+            self.handleError(record)
+        else:
+            self._stream.write(line)
 
 
 def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handler:
