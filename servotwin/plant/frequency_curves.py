@@ -14,6 +14,8 @@ from servotwin.plant.signals import Array
 _DISTINCT = 1e-9
 # Steps of 1 + L from one frequency to the next, relative to its size, up to which the curve between them is known.
 _RESOLVED = 0.8
+# Tangent of the angle between a curve at its lowest frequency and its asymptote, up to which nothing turns it below.
+_ASYMPTOTIC = 0.5
 # Logarithm of the largest gain margin that is told from an infinite one.
 _LARGEST = 700.0
 # The least value between two frequencies is searched for by zooming in.
@@ -34,6 +36,9 @@ def encirclements(returned: Complex, integrators: NDArray[np.int64]) -> tuple[ND
     steps = squares(np.diff(returned, axis=1))
     sizes = squares(returned)
     resolved = np.all(steps < _RESOLVED**2 * np.minimum(sizes[:, 1:], sizes[:, :-1]), axis=1)
+    # A slow law, or one that acts against its direction at rest, still turns the curve below the lowest frequency.
+    start = returned[:, 0] * 1j**integrators
+    resolved &= np.abs(start.imag) < _ASYMPTOTIC * start.real
     upper, left = returned.imag >= 0.0, returned.real < 0.0
     # Steps are short beside the distance from zero: a crossing of the negative real axis has an end left of zero.
     across = (upper[:, 1:] != upper[:, :-1]) & (left[:, 1:] | left[:, :-1])

@@ -19,9 +19,9 @@ from servotwin.plant.linear import Complex
 from servotwin.plant.loop_set import (
     PlantSet,
     SetMargins,
-    about_poles,
     eigenvalues,
     margins_of_responses,
+    with_closed_loop,
 )
 from servotwin.plant.schur_response import response_of
 from servotwin.plant.signals import Array
@@ -97,7 +97,7 @@ class LawSet:
     def margins(self, controller: AnyController, delay: int = 0) -> SetMargins:
         """Margins of the loop with a law, at the sample rate of this set, and with a delay in samples."""
         poles = self._poles(controller, delay)
-        extra = np.clip(about_poles(poles), self.omega[:, :1], self.omega[:, -1:])
+        extra = with_closed_loop(self.omega, poles)
         omega = np.sort(np.concatenate([self.omega, extra], axis=1), axis=1, kind="stable")
 
         def value(omega: Array) -> Complex:

@@ -247,7 +247,7 @@ def sampled_law(controller: Controller) -> StateMatrices:
     if controller.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
     law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)
-    names = ["derivative"] + ["integral"] * (controller.Ki != 0.0) + ["filtered"] * (law.loop_step < 1.0)
+    names = ["derivative"] + ["integral"] * bool(controller.Ki) + ["filtered"] * (law.loop_step < 1.0)
     names += ["notch_band", "notch_low"] * (law.notch_gain != 0.0)
     rest = LawState(0.0, 0.0, 0.0, 0.0, 1.0)
     starts = [rest._replace(**{name: 1.0}) for name in names]

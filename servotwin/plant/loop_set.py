@@ -56,7 +56,7 @@ class SetMargins(NamedTuple):
     decay : array
         1/s, rate at which the slowest closed-loop mode decays; negative: it grows.
     passivity : array
-        Least 1 + Re L(j omega). Above 0, the circle criterion excludes a limit cycle in a gap of any width.
+        Least 1 + Re L(j omega); beside more than one integrator it has no end.
     """
 
     stable: NDArray[np.bool_]
@@ -230,9 +230,7 @@ class PlantSet:
         """
         poles = eigenvalues(self._closed(law, delay))
         growth = self.frequencies(poles).real.max(axis=1)
-        # Closed-loop resonances are not those of the plant alone.
-        extra = about_poles(self.frequencies(poles))
-        extra = np.clip(extra, self.omega[:, :1], self.omega[:, -1:])
+        extra = with_closed_loop(self.omega, self.frequencies(poles))
         omega = np.concatenate([self.omega, extra], axis=1)
         order = np.argsort(omega, axis=1, kind="stable")
         omega = np.take_along_axis(omega, order, axis=1)
@@ -311,9 +309,10 @@ def margins_of_responses(omega: Array, loop: Complex, value: Callable[[Array], C
 def sampled_margins(plant: LinearSystem, law: Controller, late: int = 0) -> Margins:
     """Margins of a law on one plant at the law's own rate (Hz), whose sensor is so many samples late."""
     plants = PlantSet.of([plant], law.sample_rate, late)
+    poles = plants.frequencies(eigenvalues(plants._closed(law, 0)))
     return margins_of_response(
         lambda omega: plants.loop(law, 0, np.atleast_1d(omega)[None])[0],
-        np.unique(plants.omega[0]),
+        np.unique(np.concatenate([plants.omega, with_closed_loop(plants.omega, poles)], axis=1)),
         stable=bool(plants.margins(law).stable[0]),
     )
 
@@ -362,3 +361,14 @@ def about_poles(poles: Complex) -> Array:
     width = np.maximum(np.abs(poles.real), _NARROWEST * np.abs(poles))
     near = np.abs(poles.imag)[..., None] + width[..., None] * _ABOUT
     return np.asarray(np.abs(near).reshape(len(poles), -1))
+
+
+def with_closed_loop(omega: Array, poles: Complex) -> Array:
+    """(P, K) rad/s, beside (P, F) frequencies of plants: about the poles of their closed loops (1/s), whose resonances
+    are others, and from below the slowest of these, where a slow law crosses over."""
+    sizes, first = np.abs(poles), float(omega[:, 0].min())
+    slowest = float(sizes[sizes > _ZERO * sizes.max(axis=1, keepdims=True)].min(initial=math.inf))
+    low = min(slowest / _BEYOND, first)
+    about = np.clip(about_poles(poles), low, omega[:, -1:])
+    below = np.geomspace(low, first, int(_PER_DECADE * math.log10(first / low)) + 1)[:-1]
+    return np.concatenate([about, np.broadcast_to(below, (len(poles), below.size))], axis=1)

@@ -15,8 +15,12 @@ from hypothesis import strategies as st
 from servotwin.control.controller import Controller
 from servotwin.plant import loop as loops
 from servotwin.plant import loop_set
-from servotwin.plant.loop_set import PlantSet, SetMargins
+from servotwin.plant.actuator import VelocityDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
+from servotwin.plant.loop_set import PlantSet, SetMargins, sampled_margins
 from servotwin.plant.servo import Servo
+from servotwin.plant.transmission import Transmission
 
 SERVO = Servo.preset("paper")
 OWN = SERVO.controller
@@ -152,3 +156,38 @@ def test_stability_does_not_depend_on_what_was_asked_before(monkeypatch: pytest.
     plants = PlantSet.of([servo.plant() for servo in varied(3)], None)
     assert (plants.decays(CALM) > 0.0).all()
     assert not plants.stable(CALM).any()
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_gain_of_the_wrong_sign_is_unstable_though_its_derivative_action_hides_it(delay: int) -> None:
+    """Beyond 2 rad/s, where the plant's frequencies begin, the loop looks like a stable one."""
+    drive = Axis(
+        VelocityDrive(2.37e-3),
+        Transmission(3.15e-4, 5.5e6, 2.3e3, "free"),
+        Load((42.5, 42.5), (0.0, 4.5e6), (914.0, 2.3e3)),
+        Controller(-1.56e5, 6.26e5, 1.23e5, 0.646, sample_rate=634.0),
+    )
+    plants = PlantSet.of([drive.plant()], 634.0)
+    bare = drive.pidf.replace(Ki=0.0)
+    assert plants.stable(drive.pidf, delay).all()
+    assert not plants.stable(bare, delay).any()
+    # The integrator of the motor alone: a pole near minus the gain.
+    assert plants.decays(bare, delay)[0] < -1.0
+
+
+def test_a_law_that_is_much_slower_than_the_structure_has_its_crossover_and_its_peak() -> None:
+    rigid = Axis(VelocityDrive(1e-3), Transmission(1e-3), Load((1.0,)), Controller(1.0, 0.0, 0.0, 1.0, sample_rate=1e3))
+    # L = crossover (1 + corner / s) / s: an integral as fast as the loop has a peak of 1.15 at any speed.
+    law = rigid.pidf.replace(Kp=0.5, Ki=0.25 * 1e-3)
+    for margins in (sampled_margins(rigid.plant(), law), rigid.margins(rigid.pidf.replace(Kp=0.5, Ki=0.25 * 1e-3))):
+        (crossover,) = margins.gain_crossovers
+        golden = 5e-4 * math.sqrt(0.5 + math.sqrt(1.25))
+        assert crossover.omega == pytest.approx(golden, rel=1e-3)
+    found = PlantSet.of([rigid.plant()], 1e3).margins(law)
+    assert found.phase_margin[0] == pytest.approx(math.atan(golden / 5e-4), rel=1e-3)
+    assert found.Ms[0] == pytest.approx(1.1547, rel=1e-3)
+
+
+def test_gains_of_numpy_are_gains() -> None:
+    law = OWN.replace(Kp=np.float64(OWN.Kp), Ki=np.float64(OWN.Ki), sample_rate=500.0)
+    assert np.array_equal(loops.sampled_law(law).A, loops.sampled_law(OWN.replace(sample_rate=500.0)).A)
