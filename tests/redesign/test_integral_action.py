@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from servotwin.control.controller import Controller
+from servotwin.plant.actuator import VelocityDrive
 from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
@@ -57,6 +60,25 @@ def test_what_is_slow_is_a_quarter_of_the_crossover() -> None:
     assert len(integral_shares(slow, DEMANDS)) == 4
     assert integral_shares(slow, DEMANDS) != DEMANDS.integral
     assert integral_shares(fast, DEMANDS) == DEMANDS.integral
+
+
+def test_a_loop_that_its_integral_alone_makes_stable_keeps_all_of_it_at_all_times() -> None:
+    """`tune` finds such gains: Kp and Kd act against one another, and at rest the integral is the only one that pulls.
+
+    Without it every candidate was unstable, and that was the reason of the refusal."""
+    drive = Axis(
+        VelocityDrive(2.37e-3),
+        Transmission(3.15e-4, 5.5e6, 2.3e3, "free"),
+        Load((42.5, 42.5), (0.0, 4.5e6), (914.0, 2.3e3)),
+        Controller(-1.56e5, 6.26e5, 1.23e5, 0.646, sample_rate=634.0),
+    )
+    known = Uncertainty(gap=(0.15, 0.35), step=(1.2e-3, 3.4e-3))
+    assert integral_shares(drive, DEMANDS, disturbed=False) == (1.0,)
+    for disturbed in (False, True):
+        candidates = candidates_of(drive, known, DEMANDS, disturbed, noisy=False)
+        assert all(each.controller.Ki == drive.pidf.Ki and not each.controller.integral_only for each in candidates)
+        assert any(each.controller.Kp == drive.pidf.Kp for each in candidates)
+        assert all(nominal_margins(drive, each.controller).stable for each in candidates)
 
 
 @pytest.mark.parametrize("servo", [SCREW, Axis.preset("gantry")])

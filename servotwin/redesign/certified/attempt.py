@@ -144,9 +144,9 @@ class Question:
             f"{needed}, not {most}"
         )
 
-    def margins(self, setting: Design) -> LoopMargins:
-        """Margins of a setting on the plants of the stated ranges and beyond."""
-        return margins_in_every_zone(self.servo, widened(self.uncertainty, self.demands), setting.controller)
+    def margins(self, setting: Design, between: bool = True) -> LoopMargins:
+        """Margins of a setting on the plants of the stated ranges and beyond, for all delays or the ends alone."""
+        return margins_in_every_zone(self.servo, widened(self.uncertainty, self.demands), setting.controller, between)
 
     def missed(self, setting: Design, few: MachineMeasures) -> NDArray[np.bool_]:
         """True for machines on which a setting misses a demand: it does not settle, is off in the end or overshoots."""
@@ -243,7 +243,8 @@ class Attempt:
 
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
-        question, setting, loop = self.question, self.setting, self._loop
+        question, setting = self.question, self.setting
+        loop = question.margins(setting)
         known, law = question.uncertainty, law_for_margins(setting.controller)
         measures = self._measured(question.demands.machines)
         members, failures = len(measures.cost), int(np.sum(~measures.settled))
@@ -287,7 +288,7 @@ class Attempt:
 
     @cached_property
     def _loop(self) -> LoopMargins:
-        return self.question.margins(self.setting)
+        return self.question.margins(self.setting, between=False)
 
     @cached_property
     def _members(self) -> SimulatedMachines:

@@ -16,6 +16,7 @@ from servotwin.redesign.certified.margins import (
     has_slow_integral,
     integral_shares,
     laws_within,
+    stands_on_integral,
     widened,
     with_margins,
 )
@@ -90,7 +91,8 @@ def _opened_in_gap(plain: list[Design], zone: float) -> list[Design]:
 def _without_zone(servo: Plant, within: tuple[AnyController, ...], demands: Demands, step: float) -> tuple[Design, ...]:
     """Candidates without a dead zone that stops the whole law, the same for every gap, for a smallest step (m)."""
     laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
-    stopped = [each for law in laws if integrates(law) for each in _stopped(servo, law, step, demands)]
+    may_stop = not stands_on_integral(servo)
+    stopped = [each for law in laws if may_stop and integrates(law) for each in _stopped(servo, law, step, demands)]
     return (*(Design(law) for law in laws), *stopped)
 
 
@@ -142,7 +144,8 @@ def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, de
     """
     if isinstance(servo.controller, Controller) or not 0.0 < zone <= demands.tolerance:
         return []
-    stopped = [law.replace(integral_only=True, enter=1.0, leave=_LEAVES) for law in laws if integrates(law)]
+    stopping = [] if stands_on_integral(servo) else [law for law in laws if integrates(law)]
+    stopped = [law.replace(integral_only=True, enter=1.0, leave=_LEAVES) for law in stopping]
     opening = [law.replace(integral_only=False) for law in laws]
     opened = [law.replace(enter=enter, leave=leave) for law in opening for enter, leave in demands.hysteresis]
     return [Design(law, zone) for law in (*stopped, *opened)]

@@ -34,7 +34,8 @@ class LoopMargins:
         1/s, of the slowest mode of all plants; negative: it grows.
     passivity : float
         Least 1 + Re L of all plants. Above 0 the circle criterion excludes a limit cycle in a gap of any width, where
-        the law is continuous, linear and without integral action; of a sampled law the describing function does.
+        the law is continuous and linear; of a sampled law the describing function does. -inf where it says nothing: the
+        shaft pushes the motor or is free in the gap, the law reads the motor, or it integrates beside its motor.
     """
 
     plants: int

@@ -26,6 +26,7 @@ from servotwin.control.retuning import (
 )
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.law_set import LawSet
 from servotwin.plant.loop_set import PlantSet, sampled_margins
 from servotwin.plant.margins import GainCrossover, Margins
@@ -46,6 +47,8 @@ _LITTLE_INTEGRAL = (0.03,)
 AnyPlantSet: TypeAlias = PlantSet | LawSet
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
+# Delays between the shortest and the longest.
+_MOST_DELAYS = 8
 _WORTH_TRYING = 0.5
 # The servo's own PD and the constant that was near the best at every gap with hindsight: so the search is no worse.
 _ALWAYS = (0.6, 1.0)
@@ -77,8 +80,14 @@ def delays_of(law: AnyController, uncertainty: Uncertainty) -> tuple[int, ...]:
     return (0,) if law.sample_rate is None or uncertainty.delay == 0 else (0, uncertainty.delay)
 
 
+def _every_delay(law: AnyController, uncertainty: Uncertainty) -> tuple[int, ...]:
+    """Delays from the shortest to the longest, in samples: where resonances add crossovers one between may be worst."""
+    least, longest = delays_of(law, uncertainty)[0], delays_of(law, uncertainty)[-1]
+    return tuple(np.unique(np.linspace(least, longest, min(longest - least, _MOST_DELAYS) + 1).astype(int)).tolist())
+
+
 @lru_cache(maxsize=256)
-def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> LoopMargins:
+def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController, between: bool = True) -> LoopMargins:
     """Margins of a law on the model and over all plants of an uncertainty.
 
     Parameters
@@ -87,14 +96,17 @@ def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> 
     uncertainty : Uncertainty
         Of the plant alone, as `widened` makes it: equal ones share a stored result.
     law : Controller, Cascade or LinearLaw
+    between : bool
+        False: the shortest and the longest delay alone, in half of the time.
     """
     plants = plant_set(servo, uncertainty, law.sample_rate)
-    found = [plants.margins(law, delay) for delay in delays_of(law, uncertainty)]
+    delays = _every_delay(law, uncertainty) if between else delays_of(law, uncertainty)
+    found = [plants.margins(law, delay) for delay in delays]
     nominal = nominal_margins(servo, law)
     crossover = nominal.gain_crossovers[-1] if nominal.gain_crossovers else GainCrossover(0.0, math.pi)
     return LoopMargins(
         plants=plants.count,
-        delay=delays_of(law, uncertainty)[-1],
+        delay=delays[-1],
         Ms=nominal.Ms,
         crossover=crossover.omega,
         phase_margin=crossover.phase_margin,
@@ -103,8 +115,17 @@ def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> 
         phase_margin_worst=min(float(each.phase_margin.min()) for each in found),
         delay_margin_worst=min(float(each.delay_margin.min()) for each in found),
         decay=min(float(each.decay.min()) for each in found),
-        passivity=min(float(each.passivity.min()) for each in found),
+        passivity=min(float(each.passivity.min()) for each in found) if _gap_is_play(servo, law) else -math.inf,
     )
+
+
+def _gap_is_play(servo: Plant, law: AnyController) -> bool:
+    """True where the gap is a play in series with the loop, which the criterion is about: no load pushes the motor, the
+    law reads nothing ahead of the gap, and it does not integrate beside the motor."""
+    is_pushed = servo.backlash_kind is not BacklashKind.RIGID and servo.takes_friction
+    if is_pushed or servo.backlash_kind is BacklashKind.FREE or servo.at_motor:
+        return False
+    return isinstance(law, Controller) and (not integrates(law) or only_integrates(law))
 
 
 @lru_cache(maxsize=256)
@@ -287,14 +308,24 @@ def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> t
     """Factors on the own integral action that are tried, where friction or a bias act or not.
 
     That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it. One
-    that is all of a controller is scaled like other gains.
+    that is all of a controller is scaled like other gains, and one that a loop needs is never less.
     """
     own = servo.controller
-    if only_integrates(own):
+    if only_integrates(own) or stands_on_integral(servo):
         return (1.0,)
     if not disturbed:
         return (0.0,)
     return demands.integral if isinstance(own, Controller) and not has_slow_integral(servo) else _WHOLE_INTEGRAL
+
+
+@lru_cache(maxsize=16)
+def stands_on_integral(servo: Plant) -> bool:
+    """True where the own loop is stable with its integral action only: its proportional gain may have the other sign,
+    and no zone may stop the integral."""
+    own = law_for_margins(servo.controller)
+    if not integrates(own) or only_integrates(own) or not nominal_margins(servo, own).stable:
+        return False
+    return not nominal_margins(servo, without_integral(own)).stable
 
 
 def has_slow_integral(servo: Plant) -> bool:
@@ -303,7 +334,7 @@ def has_slow_integral(servo: Plant) -> bool:
     if not isinstance(own, Controller) or not own.Ki or not own.Kp:
         return False
     crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
-    return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
+    return bool(crossovers) and 0.0 < own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
 
 
 def _keeps_to(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...], demands: Demands) -> bool:
@@ -334,15 +365,17 @@ def _stable(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...]) ->
     return all(bool(plants.stable(law, delay).all()) for delay in delays)
 
 
-def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> LoopMargins:
+def margins_in_every_zone(
+    servo: Plant, uncertainty: Uncertainty, law: AnyController, between: bool = True
+) -> LoopMargins:
     """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral.
 
     Without an integral that is all of a law there is no loop.
     """
-    acting = loop_margins(servo, uncertainty, law_for_margins(law))
+    acting = loop_margins(servo, uncertainty, law_for_margins(law), between)
     if not law.integral_only or only_integrates(law):
         return acting
-    stopped = loop_margins(servo, uncertainty, without_integral(law_for_margins(law)))
+    stopped = loop_margins(servo, uncertainty, without_integral(law_for_margins(law)), between)
     most = {name: max(getattr(acting, name), getattr(stopped, name)) for name in ("Ms", "Ms_worst")}
     names = [field.name for field in fields(LoopMargins) if field.name.endswith("margin_worst")]
     least = {name: min(getattr(acting, name), getattr(stopped, name)) for name in (*names, "phase_margin", "passivity")}
