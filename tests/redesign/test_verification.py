@@ -198,6 +198,20 @@ def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() 
         assert not hunting.at_rest.any()
 
 
+def test_a_certificate_says_that_its_moves_begin_with_the_weight_held() -> None:
+    axis = Axis.preset("ball-screw")
+    lift = axis.replace(load=replace(axis.load, force=-30.0))
+    known, demands = Uncertainty(gap=(0.0063, 0.0063), step=(1e-4, 2e-4)), replace(SMALL, machines=4)
+    for plant, share in ((lift, 1.0), (lift, 0.0), (axis, 1.0)):
+        setting = Design(axis.pidf.replace(Ki=share * axis.pidf.Ki))
+        tried = confirm(plant, known, setting, demands, trial_for(axis, known, demands))
+        found = tried.best if isinstance(tried, NotVerified) else tried
+        assert found is not None
+        assert ("an integral that holds the load's constant force" in found.tried(plant)) == (
+            plant is lift and share > 0.0
+        )
+
+
 def test_a_delay_between_the_shortest_and_the_longest_may_be_the_worst() -> None:
     """At 100 Hz two samples turn the joint's resonance against the loop, three less so: Ms was said to be 1.34."""
     axis = Axis.preset("robot-joint")

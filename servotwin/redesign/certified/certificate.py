@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from servotwin.control.retuning import integrates
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import in_words
 from servotwin.redesign.design import Design, with_feedforward
@@ -235,6 +236,8 @@ class Certificate:
             text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
         if self.setting.controller.integral_only:
             text += ", with the integral acting and stopped; the simulations contain the switching in between"
+        if servo.guide.force and integrates(self.setting.controller):
+            text += "; every move begins with an integral that holds the load's constant force"
         if self.ramp is not None:
             text += f"; a ramp and its reversal on {self.ramp.machines} machines"
         if self.long is not None:
