@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 from sqlalchemy.pool import ConnectionPoolEntry, QueuePool
+
+# SQLAlchemy names a pool's logger after its class, and this one is ours: the log would hold the pool's every step.
+logging.getLogger(f"{__name__}.ClosingPool").setLevel(logging.WARNING)
 
 
 class ClosingPool(QueuePool):
