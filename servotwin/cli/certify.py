@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic
+from typing import TypeAlias
 
 from rich.console import Console
 from rich.progress import (
@@ -38,6 +39,7 @@ from servotwin.redesign.registry import certified_policy, check_tabled
 from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
 
+_Values: TypeAlias = tuple[float, ...] | None
 _LINE_EVERY = 30.0  # s between two lines where no bar can be shown
 
 
@@ -81,15 +83,19 @@ def certify(
     """
     console = console or Console()
     given = grid or GridOptions()
+    chosen = _chosen(file, model, out)
+    # All that is wrong with the command is said before the search, which may take minutes.
+    for name, (servo, settings) in chosen.items():
+        _check(name, servo, settings, out)
+        if isinstance(given, GridOptions):
+            given.values(name, servo)
     with _progress(console, TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
         text = "looking for a verified fallback set"
         progress.add_task(text, total=None)
         if not console.is_terminal:
             console.print(text)
-        pairs = [
-            (job, given if isinstance(given, Grid) else given.grid(job.name, job.policy))
-            for job in _jobs(file, model, out)
-        ]
+        jobs = [_table_job(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
+        pairs = [(job, given if isinstance(given, Grid) else given.grid(job.name, job.policy)) for job in jobs]
     return tuple(_verify(job, grid, console) for job, grid in pairs)
 
 
@@ -125,20 +131,23 @@ class GridOptions:
         InvalidInput
             A value is outside its range, or in a unit that the model does not have.
         """
+        return Grid.of(policy, *self.values(name, policy.servo))
+
+    def values(self, name: str, servo: Plant) -> tuple[float | None, _Values, _Values]:
+        """Finest gap (rad at the motor), biases and noises (SI) for a servo, None where not given; raises as `grid`."""
         machine = f"model {name!r}"
-        form, finest = stated_gap("finest", self.finest_deg, self.finest_at_load, machine, policy.servo)
+        form, finest = stated_gap("finest", self.finest_deg, self.finest_at_load, machine, servo)
         if finest is not None and not 0.0 < finest < math.inf:
             raise InvalidInput(f"{form.option} {finest:g} {form.unit}: must be finite and above 0")
-        units = own_units(policy.servo)
-        return Grid.of(
-            policy,
+        units = own_units(servo)
+        return (
             None if finest is None else form.at_motor(finest),
             _rising(units.key("bias_mv"), own_option(self.biases, "bias_mv", machine, units), above=True),
             _rising(units.key("noise_um"), own_option(self.noises, "noise_um", machine, units), above=False),
         )
 
 
-def _rising(key: str, text: str | None, above: bool) -> tuple[float, ...] | None:
+def _rising(key: str, text: str | None, above: bool) -> _Values:
     """Values of an option, in SI; None: not given."""
     if text is None:
         return None
@@ -153,8 +162,8 @@ def _rising(key: str, text: str | None, above: bool) -> tuple[float, ...] | None
     return tuple(map(unit_of(key).to_si, values))
 
 
-def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:
-    """Tables that a file names."""
+def _chosen(file: Path, model: str | None, out: Path | None) -> dict[str, tuple[Plant, TwinSettings]]:
+    """Models of a file whose tables are to be verified, by name."""
     table = read_toml(file)
     known = _models(table, file)
     if model is not None and model not in known:
@@ -166,7 +175,7 @@ def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:
         raise InvalidInput(f'{file}: no model has a key table = "NAME{SUFFIX}" in [twin]: give it, or --out')
     if out is not None and len(chosen) > 1:
         raise InvalidInput(f"--out {out}: {file} has {len(chosen)} models; choose one with --model")
-    return [_table_job(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
+    return chosen
 
 
 def _models(table: Table, file: Path) -> dict[str, tuple[Plant, TwinSettings]]:
@@ -181,12 +190,18 @@ def _models(table: Table, file: Path) -> dict[str, tuple[Plant, TwinSettings]]:
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 
-def _table_job(name: str, servo: Plant, settings: TwinSettings, out: Path | None) -> _TableJob:
+def _check(name: str, servo: Plant, settings: TwinSettings, out: Path | None) -> None:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
-    path = out or Path(settings.table or "")
-    check_tabled(servo, f"{path}: model {name!r}")
-    return _TableJob(name, certified_policy(servo, settings), path)
+    check_tabled(servo, f"{_path(settings, out)}: model {name!r}")
+
+
+def _path(settings: TwinSettings, out: Path | None) -> Path:
+    return out or Path(settings.table or "")
+
+
+def _table_job(name: str, servo: Plant, settings: TwinSettings, out: Path | None) -> _TableJob:
+    return _TableJob(name, certified_policy(servo, settings), _path(settings, out))
 
 
 def _verify(job: _TableJob, grid: Grid, console: Console) -> CertifiedTable:

@@ -136,10 +136,10 @@ def test_progress_is_shown_as_lines_where_there_is_no_terminal(tmp_path: Path, m
 
     def looked_for(*_given):
         assert console.file.getvalue() == "looking for a verified fallback set\n"
-        return jobs(*_given)
+        return table_job(*_given)
 
-    jobs = certification._jobs
-    monkeypatch.setattr(certification, "_jobs", looked_for)
+    table_job = certification._table_job
+    monkeypatch.setattr(certification, "_table_job", looked_for)
     monkeypatch.setattr(certification, "build", lambda *_given: (step for step in [(1, 8), (2, 8)]))
     monkeypatch.setattr(certification, "load", lambda *_given: None)
     monkeypatch.setattr(certification, "_summary", lambda *_given: "written")
@@ -155,7 +155,7 @@ def test_the_search_for_a_fallback_set_is_shown(tmp_path: Path, monkeypatch) -> 
     def interrupted(*_given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(certification, "_jobs", interrupted)
+    monkeypatch.setattr(certification, "_table_job", interrupted)
     with pytest.raises(KeyboardInterrupt):
         certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=console)
     assert "looking for a verified fallback set" in console.file.getvalue()
@@ -186,9 +186,8 @@ def test_the_search_for_a_fallback_set_is_shown(tmp_path: Path, monkeypatch) -> 
     ],
 )
 def test_a_grid_is_stated_in_the_units_of_its_model(servo: str, options, why: str) -> None:
-    policy = certified_policy(resolve_plant(servo), TwinSettings())
     with pytest.raises(InvalidInput, match=why):
-        GridOptions(**options).grid("one", policy)
+        GridOptions(**options).values("one", resolve_plant(servo))
 
 
 def test_the_units_of_a_grid_are_converted() -> None:
@@ -213,7 +212,10 @@ def test_the_units_of_a_grid_are_converted() -> None:
         ("--noise-mdeg", r"in mdeg, rising"),
     ],
 )
-def test_every_option_of_the_command_reaches_its_grid(tmp_path: Path, option: str, why: str) -> None:
+def test_every_option_of_the_command_is_checked_before_the_search(
+    tmp_path: Path, monkeypatch, option: str, why: str
+) -> None:
+    monkeypatch.setattr(certification, "certified_policy", lambda *_given: pytest.fail("it takes minutes"))
     path = twin_file(tmp_path, ("one", "one.table"))
     path.write_text(path.read_text().replace('"paper"', '"robot-joint"'), encoding="utf-8")
     shown = CliRunner().invoke(app, ["certify", str(path), option, "2,1"])
