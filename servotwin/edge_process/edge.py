@@ -25,14 +25,15 @@ from servotwin.edge_process.monitoring import TickHistogram, log
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.shared_samples import MakeRecorder
 from servotwin.runtime.service_manager import ServiceManager
+from servotwin.runtime.token_bucket import TokenBucket
 
 Clock = Callable[[], float]
 CHECK_PERIOD_S, STATUS_PERIOD_S, PAUSE_S = 0.1, 1.0, 0.005
 _LONGEST_WAIT_FOR_LINK_S = 1.0
 _LONGEST_GAP_S = 1.0
 """Time without samples after which a new boot begins."""
-_NAMES = 10.0
-"""Boots without a window that may follow each other at once."""
+_NAMES, _NAMES_PER_S = 10.0, 1.0
+"""Boots without a window that are named at once, and later on."""
 
 
 class _LinkProcessChild(Protocol):
@@ -101,8 +102,8 @@ class EdgeRuntime:
         self._boot, self._boots, self._superseded = boot, 0, False
         self._outlet, self._child, self._recorder = outlet, child, recorder
         self._manager = manager or ServiceManager({})
-        self._check_due = self._status_due = self._named_at = clock()
-        self._names = _NAMES
+        self._check_due = self._status_due = clock()
+        self._names = TokenBucket(_NAMES, _NAMES_PER_S, clock)
         self.agent = self._new_agent(first)
 
     def skip(self, missing: int, reference: float, voltage: float) -> None:
@@ -129,18 +130,11 @@ class EdgeRuntime:
         self.counts[f"boot: {why}"] += 1
         # Samples count from 0 again, so the boot needs another name: the twin must not confuse their windows. Where a
         # drive misnumbers every sample, one without windows keeps its name, or its boots would fill log and store.
-        named = self.agent.windows_cut > 0 or self._may_name()
+        named = self.agent.windows_cut > 0 or self._names.take()
         self._boots += named
         self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters(), named)
         if self._superseded:
             self.send(self.agent.superseded())
-
-    def _may_name(self) -> bool:
-        """True for the first few boots, and for one a second later on."""
-        now = self.clock()
-        self._names, self._named_at = min(_NAMES, self._names + now - self._named_at), now
-        self._names -= (may := self._names >= 1.0)
-        return may
 
     def exchange(self) -> None:
         """Exchange a piece with the link process, and give the agent the messages that have arrived."""

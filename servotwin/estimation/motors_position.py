@@ -38,7 +38,7 @@ def is_motors_position(window: Window, plant: Plant) -> bool:
 
 
 def _beyond(motor: Array, position: Array) -> float:
-    """What a position, but for a constant, exceeds the samples of the motor's about it by."""
+    """Excess of a position, but for a constant, over the samples of the motor's about it."""
     low, high = _about_each_sample(motor)
     inner = position[_APART:-_APART]
     return float(np.max(inner - high) - np.min(inner - low))

@@ -336,7 +336,7 @@ class SampledEngine:
         return out
 
     def _sensed(self, first: int, last: int) -> Array:
-        """What the position sensor sees at samples first .. last - 1, without errors and delay."""
+        """Position (m) that the sensor sees at samples first .. last - 1, without errors and delay."""
         if self.servo.at_motor:
             return self.servo.p * self.channel("theta_m", first, last)
         return self.channel("position", first, last)

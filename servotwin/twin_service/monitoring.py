@@ -19,6 +19,7 @@ import msgspec
 from servotwin.messages import Reason, Refusal
 from servotwin.runtime.log_stream import LogStream
 from servotwin.runtime.prometheus import Sample, metric_lines, number_text
+from servotwin.runtime.token_bucket import TokenBucket
 
 _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 """Upper bounds of the histograms' buckets."""
@@ -118,17 +119,14 @@ class _LineLimit:
 
     def __init__(self, monotonic: Callable[[], float]) -> None:
         self._monotonic = monotonic
-        self._lines: dict[str, tuple[float, float]] = {}
+        self._buckets: dict[str, TokenBucket] = {}
         self._omitted = collections.Counter[str]()
 
     def take(self, kind: str) -> int | None:
         """Return how many lines of a kind were omitted before the present one; None: omit this one too."""
-        now = self._monotonic()
-        lines, at = self._lines.get(kind, (_MOST_LINES, now))
-        lines = min(_MOST_LINES, lines + _LINES_PER_S * (now - at))
-        written = lines >= 1.0
-        self._lines[kind] = lines - written, now
-        if written:
+        if kind not in self._buckets:
+            self._buckets[kind] = TokenBucket(_MOST_LINES, _LINES_PER_S, self._monotonic)
+        if self._buckets[kind].take():
             return self._omitted.pop(kind, 0)
         self._omitted[kind] += 1
         return None

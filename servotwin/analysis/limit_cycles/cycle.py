@@ -171,7 +171,7 @@ def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
         near = max(_CLOSE, min(0.5 * before, _NEAR)) if closed.orbit.stable else _ON_IT
         if closed.distance < near:
             return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
-        before = closed.distance
+        before = closed.distance if closed.orbit.stable else 0.0
         kind = "a stable" if closed.orbit.stable else "an unstable"
         reason = f"{kind} orbit at {closed.orbit.frequency:.6g} Hz is {closed.distance:.2g} of its size away"
     if held:

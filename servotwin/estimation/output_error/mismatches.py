@@ -48,9 +48,13 @@ def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple
 
 def too_small(found: Search) -> str:
     """Sentence for a motion of so few counts that they hide whether the model explains it; empty: it is larger."""
-    if (share := _share(found)) <= UNEXPLAINED or not (hiding := all_rounding(found)):
+    if (share := _share(found)) <= UNEXPLAINED or not all_rounding(found):
         return ""
-    return f"{hiding} ({100.0 * share:.0f} % of the motion): larger moves are needed"
+    counts = float(np.ptp(found.problem.position)) / found.problem.count
+    return (
+        f"the position moves by only {counts:.2g} counts of the coarser encoder, whose rounding may be all that the "
+        f"model leaves ({100.0 * share:.0f} % of the motion): larger moves are needed"
+    )
 
 
 def _left(found: Search) -> float:

@@ -77,11 +77,6 @@ def rounded(found: Search, which: int = HALF) -> float:
     return rounding if math.isfinite(rounding) else 0.0
 
 
-def all_rounding(found: Search) -> str:
-    """Sentence for a window in which rounding may be all that the best fit leaves; empty where it leaves more."""
-    count, position = found.problem.count, found.problem.position
-    if rms(found.best.raw) > LEFT_COUNTS * count:
-        return ""
-    counts = float(np.ptp(position)) / count
-    moved = f"the position moves by only {counts:.2g} counts of the coarser encoder"
-    return f"{moved}, whose rounding may be all that the model leaves"
+def all_rounding(found: Search) -> bool:
+    """True where rounding may be all that the best fit leaves."""
+    return rms(found.best.raw) <= LEFT_COUNTS * found.problem.count

@@ -114,8 +114,9 @@ def judge(
 
 def _softer(found: Search, words: str) -> JudgedFit:
     """Decide on a window that a much softer shaft explains better: no mismatch where that is a matter of counts."""
-    if hiding := all_rounding(found):
-        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words, hiding))
+    if all_rounding(found):
+        rounding = "the encoders' rounding may be all that the model leaves with the stated one"
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words, rounding))
     return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(words,))
 
 
