@@ -30,8 +30,8 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.integral_action import integral_shares
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
-from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy

@@ -21,8 +21,9 @@ from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certify import is_disturbed
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.integral_action import integral_shares
 from servotwin.redesign.certified.machines import draw_independently
-from servotwin.redesign.certified.margins import integral_shares, nominal_margins
+from servotwin.redesign.certified.margins import nominal_margins
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design

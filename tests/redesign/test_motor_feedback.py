@@ -14,8 +14,8 @@ from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify, is_disturbed
 from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.integral_action import integral_shares
 from servotwin.redesign.certified.machines import draw_independently
-from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design

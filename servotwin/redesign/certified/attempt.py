@@ -28,8 +28,9 @@ from servotwin.redesign.certified.assess import (
 )
 from servotwin.redesign.certified.certificate import BeyondResult, Certificate, LongResult, LoopMargins, RampResult
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.integral_action import own_static_gain, slow_response
 from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
-from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
+from servotwin.redesign.certified.margins import margins_in_every_zone, widened
 from servotwin.redesign.certified.seeds import seed_of
 from servotwin.redesign.certified.settling_test import SettlingTest
 from servotwin.redesign.certified.tracking import follow_ramp

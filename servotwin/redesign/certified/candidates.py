@@ -12,14 +12,13 @@ from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.demands import Demands
-from servotwin.redesign.certified.margins import (
+from servotwin.redesign.certified.integral_action import (
     has_slow_integral,
     integral_shares,
-    laws_within,
+    is_pulled_off,
     stands_on_integral,
-    widened,
-    with_margins,
 )
+from servotwin.redesign.certified.margins import laws_within, widened, with_margins
 from servotwin.redesign.certified.rest_in_gap import drives_to_and_fro
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -40,17 +39,17 @@ def candidates_of(
     """Every combination of scales, shapes, feedforwards, integral action and dead zone within the bounds on Ms.
 
     The friction that acts on every machine is fed forward, all of it or none: more would push.
-    Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
-    candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
-    reference that stops the integral only. A dead zone also leaves a motor alone that would drive to and fro in the gap
-    at any gain.
+    Integral action is for friction, for an unknown input bias and for a load that holds the motor off its reference, a
+    dead zone keeps noise out of the voltage: they are candidates only where there is such a thing, or noise. Integral
+    action comes with and without a zone about the reference that stops the integral only. A dead zone also leaves a
+    motor alone that would drive to and fro in the gap at any gain.
 
     Raises
     ------
     InvalidInput
         No scaled controller is within the bounds on Ms.
     """
-    integral = integral_shares(servo, demands, disturbed)
+    integral = integral_shares(servo, demands, disturbed or is_pulled_off(servo, uncertainty))
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]

@@ -24,11 +24,8 @@ from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of, last_resort
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.integral_action import has_slow_integral, own_static_gain
 from servotwin.redesign.certified.machines import SimulatedMachines
-from servotwin.redesign.certified.margins import (
-    has_slow_integral,
-    own_static_gain,
-)
 from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain, opens_in_zone
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty

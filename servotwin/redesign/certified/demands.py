@@ -73,7 +73,8 @@ class Demands:
         Shapes tried where a filtered PID reads the motor and nothing with half of its gain is within the bounds: a
         shorter filter leaves the derivative action its phase at the resonance of the shaft, which it then damps.
     integral : tuple of float
-        Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
+        Factors on Ki, tried where there is friction, where the input bias is known to no better than `known`, or where
+        the load holds the motor off its reference.
     known : float
         Share of the smallest step: a bias that leaves a smaller error under the servo's own Kp counts as known.
     velocity : tuple of float

@@ -14,8 +14,8 @@ from servotwin.estimation.learning.trend import Trend
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.display_units import command_unit
 from servotwin.plant.plants import Plant
+from servotwin.redesign.certified.integral_action import own_static_gain
 from servotwin.redesign.certified.learnt_servo import learnt_servo
-from servotwin.redesign.certified.margins import own_static_gain
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.policy import Evidence

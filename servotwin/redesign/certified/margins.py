@@ -20,7 +20,6 @@ from servotwin.control.retuning import (
     only_integrates,
     scaled,
     slowed,
-    static_gain,
     strength,
     without_integral,
 )
@@ -36,11 +35,6 @@ from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import extreme_plants, parameters_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
-# Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered
-# PID whose corner Ki / Kp is below this share of the crossover. A faster one swings in every gap: only the small shares
-# of `Demands.integral` are tried.
-_WHOLE_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
-_SLOW_INTEGRAL = 0.25
 # The same of a cascade whose gain must be less than half of the own one: its integral stays slower than the position
 # loop, and still takes away what friction leaves.
 _LITTLE_INTEGRAL = (0.03,)
@@ -285,56 +279,6 @@ def _unit_hz(law: Controller | Cascade) -> float:
         return 1e-3 * law.sample_rate
     assert isinstance(law, Controller)
     return 0.5 / law.release if law.release > 0.0 else 1.0
-
-
-def own_static_gain(servo: Plant) -> float:
-    """Size of the command (V) with which the servo's own controller answers a constant error of one metre.
-
-    Of a controller that only integrates it is the command that moves the load by one metre.
-    """
-    law = servo.controller
-    return 1.0 / abs(slow_response(servo)[1]) if only_integrates(law) else abs(static_gain(law))
-
-
-def slow_response(servo: Plant) -> tuple[float, complex]:
-    """A frequency far below all corners of a plant (rad/s), and its response there (m/V)."""
-    plant = servo.plant()
-    corners = np.abs(plant.poles())
-    slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
-    return slow, complex(plant.response(slow))
-
-
-def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> tuple[float, ...]:
-    """Factors on the own integral action that are tried, where friction or a bias act or not.
-
-    That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it. One
-    that is all of a controller is scaled like other gains, and one that a loop needs is never less.
-    """
-    own = servo.controller
-    if only_integrates(own) or stands_on_integral(servo):
-        return (1.0,)
-    if not disturbed:
-        return (0.0,)
-    return demands.integral if isinstance(own, Controller) and not has_slow_integral(servo) else _WHOLE_INTEGRAL
-
-
-@lru_cache(maxsize=16)
-def stands_on_integral(servo: Plant) -> bool:
-    """True where the own loop is stable with its integral action only: its proportional gain may have the other sign,
-    and no zone may stop the integral."""
-    own = law_for_margins(servo.controller)
-    if not integrates(own) or only_integrates(own) or not nominal_margins(servo, own).stable:
-        return False
-    return not nominal_margins(servo, without_integral(own)).stable
-
-
-def has_slow_integral(servo: Plant) -> bool:
-    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it."""
-    own = servo.controller
-    if not isinstance(own, Controller) or not own.Ki or not own.Kp:
-        return False
-    crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
-    return bool(crossovers) and 0.0 < own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
 
 
 def _keeps_to(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...], demands: Demands) -> bool:

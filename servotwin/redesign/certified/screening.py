@@ -19,8 +19,8 @@ from servotwin.control.controller import Controller
 from servotwin.control.retuning import friction_feedforward, integrates
 from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined, steady_error
 from servotwin.redesign.certified.attempt import ROUNDED, Question
+from servotwin.redesign.certified.integral_action import has_slow_integral
 from servotwin.redesign.certified.machines import SimulatedMachines, draw
-from servotwin.redesign.certified.margins import has_slow_integral
 from servotwin.redesign.design import Design
 
 # Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.

@@ -12,9 +12,9 @@ from servotwin.control.retuning import law_for_margins, strength
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.integral_action import integral_shares, is_pulled_off
 from servotwin.redesign.certified.margins import (
     delays_of,
-    integral_shares,
     laws_within,
     nominal_margins,
     plant_set,
@@ -77,12 +77,15 @@ def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial
     InvalidInput
         No candidate is within the bounds on Ms.
     """
-    return _trial_for(servo, widened(uncertainty, demands), with_margins(demands))
+    pulled = is_pulled_off(servo, uncertainty)
+    return _trial_for(servo, widened(uncertainty, demands), with_margins(demands), pulled)
 
 
 @lru_cache(maxsize=16)
-def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
-    laws = laws_within(servo, uncertainty, demands, integral_shares(servo, demands, disturbed=False))
+def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands, pulled: bool) -> Trial:
+    # The shortest runs in which the largest share of the own integral takes away what the load holds it off.
+    shares = integral_shares(servo, demands, disturbed=pulled)
+    laws = laws_within(servo, uncertainty, demands, tuple(sorted({shares[0], shares[-1]})))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
     loop = nominal_margins(servo, law_for_margins(_reference(servo.controller, laws)))
