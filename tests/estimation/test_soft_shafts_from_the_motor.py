@@ -87,13 +87,10 @@ def stated(stiffness=0.784379):
 
 @pytest.mark.slow
 def test_a_gap_behind_a_soft_shaft_lies_inside_or_is_refused():
-    """An interval of 3 % was off by five half-widths: minima beside leave nearly as little.
-
-    Which of them is found, and why it is refused, is left to the processor's rounding."""
+    """An interval of 3 % was off by five half-widths: minima beside leave nearly as little."""
     estimate = estimate_gap(soft_window(), stated())
     assert not estimate.ok or estimate.interval[0] <= GAP <= estimate.interval[1]
-    assert estimate.status is not GapStatus.LOWER_BOUND or estimate.gap <= GAP
-    assert estimate.ok or estimate.reasons
+    assert estimate.status in (GapStatus.OK, GapStatus.UNIDENTIFIABLE)
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def _held_by_force(servo: Plant, gap: float) -> float:
 
 
 def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> tuple[float, ...]:
-    """Factors on the own integral action that are tried, where friction or a bias act or not.
+    """Factors on the own integral action that are tried; `disturbed`: friction, a bias or a pulled load asks for it.
 
     That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it. One
     that is all of a controller is scaled like other gains, and one that a loop needs is never less.

@@ -83,7 +83,8 @@ def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial
 
 @lru_cache(maxsize=16)
 def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands, pulled: bool) -> Trial:
-    # The shortest runs in which the largest share of the own integral takes away what the load holds it off.
+    # Runs last until the largest share of the own integral has taken away what the load holds it off: smaller ones
+    # would make all runs longer.
     shares = integral_shares(servo, demands, disturbed=pulled)
     laws = laws_within(servo, uncertainty, demands, tuple(sorted({shares[0], shares[-1]})))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
