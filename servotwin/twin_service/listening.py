@@ -19,6 +19,9 @@ log = logging.getLogger(__name__)
 
 BACKLOG = 2048
 """Connections that wait to be accepted: after an outage all edges connect at once."""
+_RESERVE = 64
+"""Descriptors at most, of a quarter of those that the process may have, that no connection takes: the store, the logs
+and the workers open files too, and without a reserve the last spare descriptor is soon theirs."""
 _TOLD_S = 60.0
 """s between two lines about connections for which there was no descriptor."""
 
@@ -26,23 +29,30 @@ _TOLD_S = 60.0
 class _Listener(socket.socket):
     """Listening socket that closes a new connection at once where the process has no descriptor left for it.
 
-    asyncio would leave it to wait, and try again 2048 times a second, with a line in the log for each.
+    asyncio would leave it to wait, and try again 2048 times a second, with a line in the log for each. Descriptors are
+    given out lowest first, so that the number of a connection's own says how many are left.
     """
 
     _spare: int | None = None
-    _closed, _told = 0, -math.inf
+    _refused, _told = 0, -math.inf
 
     def accept(self) -> tuple[socket.socket, Any]:
         if self._spare is None:
             with suppress(OSError):
                 self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            return super().accept()
+            connection, address = super().accept()
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE):
                 raise
-        self._free_spare()
-        with suppress(OSError), closing(super().accept()[0]):
+            self._free_spare()
+            with suppress(OSError), closing(super().accept()[0]):
+                self._note()
+            raise BlockingIOError from None
+        most = most_descriptors()
+        if connection.fileno() < most - min(_RESERVE, most // 4):
+            return connection, address
+        with closing(connection):
             self._note()
         raise BlockingIOError
 
@@ -56,9 +66,9 @@ class _Listener(socket.socket):
             self._spare = None
 
     def _note(self) -> None:
-        self._closed += 1
+        self._refused += 1
         if (now := time.monotonic()) >= self._told + _TOLD_S:
-            log.error("connections closed: no descriptor left", extra={"number": self._closed})
+            log.error("connections closed: no descriptor left", extra={"number": self._refused})
             self._told = now
 
 

@@ -15,6 +15,8 @@ import pytest
 from service_system import MSGPACK, bearer, place, twin_file, window
 
 from servotwin.messages import encode
+from servotwin.twin_service import listening
+from servotwin.twin_service.twin_file import read_twin
 
 DESCRIPTORS, STRANGERS = 60, 100
 FULL = "connections closed: no descriptor left"
@@ -54,6 +56,22 @@ def is_healthy(url: str) -> bool:
     with contextlib.suppress(httpx.TransportError):
         return httpx.get(f"{url}/healthz", timeout=5.0).status_code == 200
     return False
+
+
+@pytest.mark.parametrize(("granted", "is_kept"), [(1_000_000, True), (8, False)])
+def test_the_last_quarter_of_the_descriptors_is_kept_from_connections(
+    granted: int, is_kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listening, "most_descriptors", lambda: granted)
+    config = read_twin(twin_file(tmp_path, tokens=False)).service
+    with listening.listening_socket(config) as listener, socket.create_connection(listener.getsockname()) as client:
+        if is_kept:
+            listener.accept()[0].close()
+        else:
+            with pytest.raises(BlockingIOError):
+                listener.accept()
+        client.settimeout(5.0)
+        assert client.recv(1) == b""
 
 
 @pytest.mark.slow
